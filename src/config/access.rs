@@ -5,53 +5,38 @@ use std::path::PathBuf;
 use std::str::FromStr;
 
 use reqwest::Url;
-use schemars::{JsonSchema, Schema, SchemaGenerator};
-use serde::{Deserialize, Deserializer, Serialize};
+use schemars::{Schema, SchemaGenerator};
+use serde::{Deserialize, Deserializer};
 use serde_json::Value;
 
 use super::{Secret, list};
 
-/// Keys, quotas, signed URLs and headers for browsers.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields, default)]
-pub struct AccessConfig {
+section! {
+    /// Keys, quotas, signed URLs and headers for browsers.
+    AccessConfig;
     /// TOML file of keys; `molmesh key new` prints entries for it. Default `none`: no key is required. The file is
     /// reloaded when it changes, and on SIGHUP.
-    pub keys_file: Option<PathBuf>,
+    keys_file: Option<PathBuf> = None;
     /// Keys that sign URLs, as `ID:SECRET` or `ID@GROUP:SECRET` separated by white space. The first one signs, all are
     /// accepted, so that keys can be rotated. A signed URL opens what the keys of the group hold. Default `none`: no
     /// signature is accepted.
-    pub signing_secret: Option<Secret>,
+    signing_secret: Option<Secret> = None;
     /// File that contains the value of `signing_secret`. Default `none`.
-    pub signing_secret_file: Option<PathBuf>,
+    signing_secret_file: Option<PathBuf> = None;
     /// Requests of one address per minute. Default `none`: unlimited. Requests with a key have the key's quota instead.
     #[serde(deserialize_with = "count")]
-    pub address_requests: Option<u64>,
+    address_requests: Option<u64> = None;
     /// Computing time for the jobs of one address per minute, s. Default `none`: unlimited.
     #[serde(deserialize_with = "count")]
-    pub address_work_s: Option<u64>,
+    address_work_s: Option<u64> = None;
     /// Origins whose pages may read responses and send requests without a key: `auto`, `*`, or a list such as
     /// `https://viewer.example`. Default `auto`: loopback origins if the service listens on a loopback address, no
     /// others. `none`: only pages of this server.
     #[serde(with = "list")]
     #[schemars(schema_with = "Origins::schema")]
-    pub cors_origins: Option<Origins>,
+    cors_origins: Option<Origins> = Some(Origins::Auto);
     /// Allows pages of these origins to send credentials, such as the cookies of a proxy. Default false. Excludes `*`.
-    pub cors_credentials: bool,
-}
-
-impl Default for AccessConfig {
-    fn default() -> Self {
-        Self {
-            keys_file: None,
-            signing_secret: None,
-            signing_secret_file: None,
-            address_requests: None,
-            address_work_s: None,
-            cors_origins: Some(Origins::Auto),
-            cors_credentials: false,
-        }
-    }
+    cors_credentials: bool = false;
 }
 
 /// Deserializes an optional count from a number or text; its default `none` does not tell the loader the type.

@@ -1,7 +1,6 @@
 //! Configuration of the GPUs.
 
-use schemars::JsonSchema;
-use serde::{Deserialize, Deserializer, Serialize, Serializer};
+use serde::{Deserialize, Deserializer, Serializer};
 
 use crate::surface::DeviceChoice;
 use crate::surface::devices::EXPECTED;
@@ -10,25 +9,18 @@ use crate::surface::devices::EXPECTED;
 /// the next file is read, and only concurrent jobs can share a submission.
 pub const JOBS_PER_DEVICE: usize = 16;
 
-/// GPUs.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields, default)]
-pub struct DevicesConfig {
+section! {
+    /// GPUs.
+    DevicesConfig;
     /// Permitted devices: `auto`, `all`, `cpu`, or a list such as `0,2` or `software`. Default `auto`: the best kind of
     /// GPU that is present, else the CPU.
     #[serde(rename = "use", serialize_with = "write", deserialize_with = "read")]
     #[schemars(with = "String")]
-    pub choice: DeviceChoice,
+    choice: DeviceChoice = DeviceChoice::Auto;
     /// Readback buffers per device, bytes of host memory: allocated before the first job and kept while the device is
     /// idle. Default 2 GiB: meshes of up to 40 million triangles. The driver takes half a second to allocate it, for
     /// which the first large mesh would wait. 0: none.
-    pub readback_bytes: u64,
-}
-
-impl Default for DevicesConfig {
-    fn default() -> Self {
-        Self { choice: DeviceChoice::Auto, readback_bytes: 2 << 30 }
-    }
+    readback_bytes: u64 = 2 << 30;
 }
 
 fn write<S: Serializer>(choice: &DeviceChoice, serializer: S) -> Result<S::Ok, S::Error> {

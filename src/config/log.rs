@@ -14,18 +14,11 @@ pub enum LogFormat {
     Json,
 }
 
-/// Log, written to standard error.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields, default)]
-pub struct LogConfig {
+section! {
+    /// Log, written to standard error.
+    LogConfig;
     /// Filter of log lines, as `level` or `target=level,…`. Default `info`: one line per request.
-    pub filter: String,
+    filter: String = "info".to_owned();
     /// Format of log lines, `pretty` or `json`. Default `pretty`, which is readable on a terminal.
-    pub format: LogFormat,
-}
-
-impl Default for LogConfig {
-    fn default() -> Self {
-        Self { filter: "info".to_owned(), format: LogFormat::default() }
-    }
+    format: LogFormat = LogFormat::default();
 }

@@ -4,6 +4,27 @@
 //! their unit (`_ms`, `_bytes`). Unknown keys are rejected in every layer. Skipped fields have no key: they are fixed
 //! in a service, and only tests change them.
 
+/// Declares the struct of a section, with the default of each key beside it: `key: Type = default;`.
+macro_rules! section {
+    (
+        $(#[$attribute:meta])* $section:ident;
+        $($(#[$attribute_of_key:meta])* $key:ident: $type:ty = $default:expr;)+
+    ) => {
+        $(#[$attribute])*
+        #[derive(Debug, Clone, PartialEq, serde::Serialize, serde::Deserialize, schemars::JsonSchema)]
+        #[serde(deny_unknown_fields, default)]
+        pub struct $section {
+            $($(#[$attribute_of_key])* pub $key: $type,)+
+        }
+
+        impl Default for $section {
+            fn default() -> Self {
+                Self { $($key: $default,)+ }
+            }
+        }
+    };
+}
+
 mod access;
 mod archive;
 mod broker;

@@ -21,31 +21,30 @@ pub enum Role {
     Worker,
 }
 
-/// Listeners and limits of connections.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields, default)]
-pub struct ServerConfig {
+section! {
+    /// Listeners and limits of connections.
+    ServerConfig;
     /// Address of the service. Default 127.0.0.1:8080: the service is not exposed unless configured. Port 0 selects a
     /// free port.
-    pub listen: SocketAddr,
+    listen: SocketAddr = SocketAddr::from((Ipv4Addr::LOCALHOST, 8080));
     /// Role of this node: `all`, `api` (answers requests, claims no asynchronous jobs) or `worker` (claims asynchronous
     /// jobs, answers only probes and `/version`). Default `all`. The others need `broker.url`.
-    pub role: Role,
+    role: Role = Role::default();
     /// Host names by which clients reach the service, without ports, besides the names of the loopback addresses.
     /// Default `none`: a service that listens on a loopback address answers requests for any other name with a 421, so
     /// that a web page cannot reach it through its own host name. With a list, this applies to every address.
     #[serde(with = "list")]
     #[schemars(schema_with = "Hosts::schema")]
-    pub hosts: Option<Hosts>,
+    hosts: Option<Hosts> = None;
     /// Address of `/metrics`. Default `none`: no port is free on every machine. The address is separate, so that a
     /// proxy cannot expose the metrics by accident.
-    pub metrics_listen: Option<SocketAddr>,
+    metrics_listen: Option<SocketAddr> = None;
     /// Folder of all stored data, and by default of the archive. Default `molmesh-data` in the working folder, which is
     /// usually writable.
-    pub data_dir: PathBuf,
+    data_dir: PathBuf = PathBuf::from("molmesh-data");
     /// Number of open connections. Default 1,024. Further ones get a 503 and are closed. The hard limit of open files
     /// should be a few hundred higher; `molmesh doctor` compares them.
-    pub connections: usize,
+    connections: usize = 1024;
     /// Share of one client in each of five limits, as a fraction from 0 to 1. A share has at least one slot. In
     /// `server.connections`, clients are told apart by the address of the peer; `trusted_proxies` have no share. In the
     /// 256 meshes in progress, the 8 fetches from the archive and the threads that read structures outside of jobs
@@ -55,57 +54,35 @@ pub struct ServerConfig {
     /// `limits.memory_bytes`, a client whose other requests hold more than the share leaves as much to others.
     #[serde(deserialize_with = "telemetry::ratio")]
     #[schemars(range(min = 0, max = 1))]
-    pub client_share: f64,
+    client_share: f64 = 0.25;
     /// Time for the head of a request, ms, counted from the connection or the previous response; also the time that an
     /// idle HTTP/1.1 connection is kept. Fixed: slow clients need seconds, only attackers need a minute.
     #[serde(skip)]
-    pub header_timeout_ms: u64,
+    header_timeout_ms: u64 = 15_000;
     /// Time for the whole body of a request, ms. Fixed: 256 MiB at 36 Mbit/s.
     #[serde(skip)]
-    pub body_timeout_ms: u64,
+    body_timeout_ms: u64 = 60_000;
     /// Time in which a client must receive 16 KiB of a response body, or the rest of it, ms. Fixed: buffers and
     /// delivery slots are held until a body is sent. A client that has received more may pause longer, one second per
     /// 16 KiB, up to four times this value. Event streams are exempt.
     #[serde(skip)]
-    pub write_timeout_ms: u64,
+    write_timeout_ms: u64 = 30_000;
     /// Longest silence of an event stream before a comment is sent, ms. Fixed: proxies commonly close idle connections
     /// after half a minute.
     #[serde(skip)]
-    pub heartbeat_ms: u64,
+    heartbeat_ms: u64 = 15_000;
     /// Time that an idle HTTP/2 connection is kept, ms. Fixed: proxies usually reuse it within that time.
     #[serde(skip)]
-    pub idle_timeout_ms: u64,
+    idle_timeout_ms: u64 = 120_000;
     /// Time after SIGTERM in which `/readyz` answers 503 while all requests are served, on new connections too, ms;
     /// `none` skips it. Default 3,000: load balancers and orchestrators need a second or two to stop sending requests.
-    pub termination_notice_ms: Option<u64>,
+    termination_notice_ms: Option<u64> = Some(3000);
     /// Time after `termination_notice_ms` for running requests and jobs to finish, ms. Default 20,000: orchestrators
     /// commonly kill after 30 seconds; with `termination_notice_ms` and one second for cancelled jobs a stop takes 24.
-    pub drain_timeout_ms: u64,
+    drain_timeout_ms: u64 = 20_000;
     /// Trusted proxies, by address or network, whose `X-Forwarded-For` names the client. Default `none`: the peer is
     /// the client, and the header is ignored.
     #[serde(with = "list")]
     #[schemars(schema_with = "Proxies::schema")]
-    pub trusted_proxies: Option<Proxies>,
-}
-
-impl Default for ServerConfig {
-    fn default() -> Self {
-        Self {
-            role: Role::default(),
-            listen: SocketAddr::from((Ipv4Addr::LOCALHOST, 8080)),
-            hosts: None,
-            metrics_listen: None,
-            data_dir: PathBuf::from("molmesh-data"),
-            connections: 1024,
-            client_share: 0.25,
-            header_timeout_ms: 15_000,
-            body_timeout_ms: 60_000,
-            write_timeout_ms: 30_000,
-            heartbeat_ms: 15_000,
-            idle_timeout_ms: 120_000,
-            termination_notice_ms: Some(3000),
-            drain_timeout_ms: 20_000,
-            trusted_proxies: None,
-        }
-    }
+    trusted_proxies: Option<Proxies> = None;
 }

@@ -7,80 +7,56 @@ use std::path::PathBuf;
 use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
-/// Store of inputs, results and job records.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields, default)]
-pub struct StoreConfig {
+section! {
+    /// Store of inputs, results and job records.
+    StoreConfig;
     /// Location of the store: `s3://bucket`, `s3://bucket/prefix`, or with `broker.url` a folder that all nodes share,
     /// such as `file:///shared/store`. Default `none`: the folder `store` in `server.data_dir`.
-    pub url: Option<String>,
+    url: Option<String> = None;
     /// URL of an S3-compatible service, such as `https://minio.example:9000`. Default `none`: `AWS_ENDPOINT_URL`, else
     /// AWS in the region.
-    pub endpoint: Option<String>,
+    endpoint: Option<String> = None;
     /// Region of the bucket. Default `none`: `AWS_REGION`, else `us-east-1`.
-    pub region: Option<String>,
+    region: Option<String> = None;
     /// Allows an endpoint with plain `http`. Default false: contents would not be encrypted.
-    pub allow_http: bool,
+    allow_http: bool = false;
     /// Access key id. Default `none`: `AWS_ACCESS_KEY_ID`, else the other AWS credential sources of the machine.
-    pub access_key_id: Option<String>,
+    access_key_id: Option<String> = None;
     /// Secret access key. Default `none`: `AWS_SECRET_ACCESS_KEY`. Prefer the environment variable or
     /// `secret_access_key_file` to the configuration file.
-    pub secret_access_key: Option<Secret>,
+    secret_access_key: Option<Secret> = None;
     /// File that contains the value of `secret_access_key`, such as a mounted container secret; one line break at its
     /// end is ignored. Default `none`. Excludes `secret_access_key`.
-    pub secret_access_key_file: Option<PathBuf>,
+    secret_access_key_file: Option<PathBuf> = None;
     /// Time without a response after which a request to S3 fails or is retried, and time limit of an operation of a
     /// folder, ms. Default 30,000: a part of 8 MiB at 2 Mbit/s, or an upload of 256 MiB on a slow disk.
-    pub timeout_ms: u64,
+    timeout_ms: u64 = 30_000;
     /// Minimum time between health checks of the store, ms; `/readyz` writes, reads and removes a small object. Fixed:
     /// orchestrators send a request every few seconds.
     #[serde(skip)]
-    pub check_interval_ms: u64,
+    check_interval_ms: u64 = 5000;
     /// Time between removals of expired objects, ms. Fixed: times to live are hours.
     #[serde(skip)]
-    pub sweep_ms: u64,
+    sweep_ms: u64 = 60_000;
     /// Capacity for results and inputs together, bytes. Default 10 GiB: thousands of meshes. The least recently used
     /// objects are evicted.
-    pub max_bytes: u64,
+    max_bytes: u64 = 10 << 30;
     /// Maximum number of results, their reports and inputs together. Fixed: their index takes up to 200 MB of memory.
     /// The least recently used objects are evicted.
     #[serde(skip)]
-    pub max_objects: u64,
+    max_objects: u64 = 500_000;
     /// Time that a result and the record of a job are kept after their last use, ms. Default 86,400,000 (a day): most
     /// repeated requests come soon.
-    pub result_ttl_ms: u64,
+    result_ttl_ms: u64 = 86_400_000;
     /// Time that an input is kept after its last use, ms. Default 604,800,000 (7 days): users mesh a structure again
     /// with other parameters.
-    pub input_ttl_ms: u64,
+    input_ttl_ms: u64 = 604_800_000;
     /// Memory for cached small results, bytes. Fixed: thousands of small proteins.
     #[serde(skip)]
-    pub memory_bytes: u64,
+    memory_bytes: u64 = 256 << 20;
     /// Largest result that is cached in memory, bytes. Fixed: dozens of results of that size fit.
     #[serde(skip)]
-    pub memory_object_bytes: u64,
-}
-
-impl Default for StoreConfig {
-    fn default() -> Self {
-        Self {
-            url: None,
-            endpoint: None,
-            region: None,
-            allow_http: false,
-            access_key_id: None,
-            secret_access_key: None,
-            secret_access_key_file: None,
-            timeout_ms: 30_000,
-            check_interval_ms: 5000,
-            sweep_ms: 60_000,
-            max_bytes: 10 << 30,
-            max_objects: 500_000,
-            result_ttl_ms: 86_400_000,
-            input_ttl_ms: 604_800_000,
-            memory_bytes: 256 << 20,
-            memory_object_bytes: 4 << 20,
-        }
-    }
+    memory_object_bytes: u64 = 4 << 20;
 }
 
 /// Text that `Debug`, serialization and error messages never show.

@@ -4,57 +4,41 @@ use std::path::PathBuf;
 
 use reqwest::Url;
 use reqwest::header::{HeaderMap, HeaderName, HeaderValue};
-use schemars::JsonSchema;
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
 use super::Secret;
 use super::store::HIDDEN;
 
-/// Export of traces to a collector with OTLP over HTTP (protobuf). Off by default.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields, default)]
-pub struct TelemetryConfig {
+section! {
+    /// Export of traces to a collector with OTLP over HTTP (protobuf). Off by default.
+    TelemetryConfig;
     /// Base URL of the collector, such as `http://localhost:4318`; spans are sent to `/v1/traces` below it. Default
     /// `none`: no spans are recorded. Trace ids are passed on and logged in any case.
     #[serde(deserialize_with = "endpoint")]
     #[schemars(regex(pattern = "^(none|https?://[^?#@]+)$"))]
-    pub endpoint: Option<String>,
+    endpoint: Option<String> = None;
     /// Fraction of new traces that are sampled, from 0 to 1. Default 1. The sampled flag of
     /// `traceparent` decides for requests that have one.
     #[serde(deserialize_with = "ratio")]
     #[schemars(range(min = 0, max = 1))]
-    pub sample_ratio: f64,
+    sample_ratio: f64 = 1.0;
     /// HTTP headers for the collector, as `name=value,name=value`, such as an API key. Default `none`. Prefer the
     /// environment variable or `secret_headers_file` to the configuration file.
     #[schemars(with = "Option<Secret>")]
-    pub secret_headers: Option<SecretHeaders>,
+    secret_headers: Option<SecretHeaders> = None;
     /// File that contains the value of `secret_headers`. Default `none`.
-    pub secret_headers_file: Option<PathBuf>,
+    secret_headers_file: Option<PathBuf> = None;
     /// Maximum time to send a batch, retries included, ms. Fixed: the default of OpenTelemetry's exporters.
     #[serde(skip)]
-    pub timeout_ms: u64,
+    timeout_ms: u64 = 10_000;
     /// Maximum number of spans that wait for export; further ones are dropped. Fixed: the spans of some 250 requests,
     /// about 2 MB.
     #[serde(skip)]
-    pub queue: usize,
+    queue: usize = 4096;
     /// Maximum time to export the queued spans when the service stops, ms. Fixed: a running collector needs a fraction
     /// of it, and an unreachable one must not delay the stop.
     #[serde(skip)]
-    pub flush_timeout_ms: u64,
-}
-
-impl Default for TelemetryConfig {
-    fn default() -> Self {
-        Self {
-            endpoint: None,
-            sample_ratio: 1.0,
-            secret_headers: None,
-            secret_headers_file: None,
-            timeout_ms: 10_000,
-            queue: 4096,
-            flush_timeout_ms: 2000,
-        }
-    }
+    flush_timeout_ms: u64 = 2000;
 }
 
 /// Deserializes a number from 0 to 1.
