@@ -25,10 +25,13 @@ pub(crate) struct Access {
     keys: Option<Keys>,
     signing: Option<SigningKeys>,
     /// Quota per address of clients without a key; `None` means unlimited.
-    address_quota: Option<Arc<Quota>>,
-    meter: Arc<QuotaMeter>,
-    sites: Sites,
-    allows_credentials: bool,
+    pub(crate) address_quota: Option<Arc<Quota>>,
+    /// Usage of quotas.
+    pub(crate) meter: Arc<QuotaMeter>,
+    /// Origins and host names of the service.
+    pub(crate) sites: Sites,
+    /// True if pages of other origins may send credentials.
+    pub(crate) allows_credentials: bool,
     trusted_proxies: Option<Proxies>,
 }
 
@@ -106,26 +109,6 @@ impl Access {
         self.signing.as_ref()?.sign(Some(&signature.key_id), target, signature.until).ok()
     }
 
-    /// Returns the quota of clients without a key.
-    pub(crate) fn address_quota(&self) -> Option<&Arc<Quota>> {
-        self.address_quota.as_ref()
-    }
-
-    /// Returns the usage meter.
-    pub(crate) fn meter(&self) -> &Arc<QuotaMeter> {
-        &self.meter
-    }
-
-    /// Returns the origins and host names of the service.
-    pub(crate) fn sites(&self) -> &Sites {
-        &self.sites
-    }
-
-    /// Returns true if pages of other origins may send credentials.
-    pub(crate) fn allows_credentials(&self) -> bool {
-        self.allows_credentials
-    }
-
     /// Returns the client address of a request from `peer`, given the values of `X-Forwarded-For`.
     pub(crate) fn client<'a>(&self, peer: IpAddr, values: impl DoubleEndedIterator<Item = &'a str>) -> IpAddr {
         forwarded::client(peer, values, self.trusted_proxies.as_ref())
@@ -185,7 +168,7 @@ mod tests {
     #[test]
     fn default_configuration_requires_no_key() {
         let access = open(|_| {}).unwrap();
-        assert!(!access.is_closed() && access.address_quota().is_none());
+        assert!(!access.is_closed() && access.address_quota.is_none());
         assert_eq!(access.check_signature("/", Some("signature=x"), SystemTime::now()), SignatureCheck::Absent);
         assert_eq!(access.refresh(true).unwrap(), None);
     }

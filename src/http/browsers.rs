@@ -67,7 +67,7 @@ pub(super) fn cors(access: &Arc<Access>) -> CorsLayer {
         .allow_methods([Method::GET, Method::HEAD, Method::POST, Method::DELETE])
         .expose_headers(exposed.collect::<Vec<_>>())
         .max_age(std::time::Duration::from_hours(24));
-    if access.sites().allows_any_origin() {
+    if access.sites.allows_any_origin() {
         if !access.is_closed() {
             return layer.allow_origin(Any).allow_headers(Any);
         }
@@ -75,8 +75,8 @@ pub(super) fn cors(access: &Arc<Access>) -> CorsLayer {
         let all = [HeaderName::from_static("*"), header::AUTHORIZATION];
         return layer.allow_origin(Any).allow_headers(AllowHeaders::list(all));
     }
-    let (shared, credentials) = (Arc::clone(access), access.allows_credentials());
-    let allows = move |origin: &HeaderValue, _: &Parts| origin.to_str().is_ok_and(|o| shared.sites().allows_origin(o));
+    let (shared, credentials) = (Arc::clone(access), access.allows_credentials);
+    let allows = move |origin: &HeaderValue, _: &Parts| origin.to_str().is_ok_and(|o| shared.sites.allows_origin(o));
     layer
         .allow_origin(AllowOrigin::predicate(allows))
         .allow_headers(AllowHeaders::list(ALLOWED))
@@ -86,7 +86,7 @@ pub(super) fn cors(access: &Arc<Access>) -> CorsLayer {
 /// Adds security headers that the handler has not set.
 pub(super) async fn restrain(State(app): State<Shared>, request: Request, next: Next) -> Response {
     let mut response = next.run(request).await;
-    let sites = app.access.sites();
+    let sites = &app.access.sites;
     let headers = response.headers_mut();
     // Browsers must not interpret a mesh as a script or a page.
     headers.insert(header::X_CONTENT_TYPE_OPTIONS, HeaderValue::from_static("nosniff"));

@@ -84,7 +84,7 @@ impl Caller {
     fn address(access: &Access, request: &Request) -> Self {
         let Some(Peer(peer)) = request.extensions().get::<Peer>() else { return Self::default() };
         let values = request.headers().get_all("x-forwarded-for").iter().filter_map(|v| v.to_str().ok());
-        Self::new(&client_name(access.client(*peer, values)), false, access.address_quota())
+        Self::new(&client_name(access.client(*peer, values)), false, access.address_quota.as_ref())
     }
 
     fn within(self, namespace: Namespace) -> Self {
@@ -145,7 +145,7 @@ pub(super) async fn check(State(app): State<Shared>, mut request: Request, next:
         return Problem::new(ProblemType::NotReady, detail).retry_after(RECORDS_WAIT).into_response();
     }
     let account = caller.account.clone();
-    let running = account.as_ref().map(|account| app.access.meter().admit(account, Instant::now())).transpose();
+    let running = account.as_ref().map(|account| app.access.meter.admit(account, Instant::now())).transpose();
     request.extensions_mut().insert(caller);
     let mut response = match running {
         Ok(None) => next.run(request).await,
@@ -322,12 +322,12 @@ impl App {
     /// Fails if the caller's quota of work is used up.
     pub(super) fn admit_work(&self, caller: &Caller) -> Result<(), Problem> {
         let Some(account) = &caller.account else { return Ok(()) };
-        self.access.meter().admit_work(account, Instant::now()).map_err(|exceeded| refusal(&exceeded))
+        self.access.meter.admit_work(account, Instant::now()).map_err(|exceeded| refusal(&exceeded))
     }
 
     /// Charges `time` of work that is not a job to `caller`.
     pub(super) fn charge(&self, caller: &Caller, time: Duration) {
-        self.access.meter().spent(caller.client.0, time, Instant::now());
+        self.access.meter.spent(caller.client.0, time, Instant::now());
     }
 }
 
@@ -335,7 +335,7 @@ impl App {
 fn add_quota_headers(access: &Access, account: &Account, response: &mut Response) {
     // A client without remaining quota would delay following the redirect.
     let redirects = response.headers().contains_key(header::LOCATION) && response.status().is_redirection();
-    let usage = access.meter().usage(account, Instant::now());
+    let usage = access.meter.usage(account, Instant::now());
     let fields = [
         (RATE_LIMIT_POLICY, rate_limit_policy(&account.quota)),
         (RATE_LIMIT, rate_limit(&account.quota, &usage).filter(|_| !redirects)),

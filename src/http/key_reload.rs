@@ -15,7 +15,7 @@ const INTERVAL: Duration = Duration::from_secs(2);
 /// Publishes the number of clients with a quota.
 #[expect(clippy::cast_precision_loss, reason = "gauges are floats, counts of clients are small")]
 pub(super) fn publish_clients(access: &Access) {
-    gauge!(QUOTA_CLIENTS).set(access.meter().clients() as f64);
+    gauge!(QUOTA_CLIENTS).set(access.meter.clients() as f64);
 }
 
 /// Reloads the key file when it changes and on SIGHUP. Without keys it does nothing, and SIGHUP keeps its default

@@ -44,7 +44,7 @@ pub(super) fn check_host(sites: &Sites, request: &Request) -> Result<Option<Auth
 }
 
 fn admit(access: &Access, request: &Request) -> Result<(), Problem> {
-    let host = check_host(access.sites(), request)?;
+    let host = check_host(&access.sites, request)?;
     if is_foreign(access, request, host.as_ref()) && !has_key(access, request) && !opens_page(request) {
         let detail = "a page of another origin made this request, and the service does not allow that origin";
         return Err(Problem::new(ProblemType::CrossSite, detail));
@@ -74,7 +74,7 @@ fn host(request: &Request) -> Result<Option<Authority>, Problem> {
 /// Returns true if a page of an origin that may not read responses made the request.
 fn is_foreign(access: &Access, request: &Request, host: Option<&Authority>) -> bool {
     let origin = request.headers().get(ORIGIN).map(|origin| origin.to_str().unwrap_or("null"));
-    if access.sites().allows_any_origin() || origin.is_some_and(|origin| access.sites().allows_origin(origin)) {
+    if access.sites.allows_any_origin() || origin.is_some_and(|origin| access.sites.allows_origin(origin)) {
         return false;
     }
     match request.headers().get(SEC_FETCH_SITE).map(HeaderValue::as_bytes) {

@@ -119,7 +119,7 @@ impl Server {
     pub async fn bind(config: Config, chosen: Chosen) -> Result<Self, ServeError> {
         let Chosen { backend, reason, renderer, devices: found } = chosen;
         let access = Arc::new(Access::open(&config)?);
-        if access.sites().lacks_origins() {
+        if access.sites.lacks_origins() {
             tracing::warn!("pages of other origins are rejected: set access.cors_origins to their origins, or to none");
         }
         let (listener, addr) = listen("server.listen", config.server.listen).await?;
@@ -145,7 +145,7 @@ impl Server {
             renderer,
             meter: Some(Arc::new({
                 let access = Arc::clone(&access);
-                move |client: Client, time| access.meter().spent(client.0, time, Instant::now())
+                move |client: Client, time| access.meter.spent(client.0, time, Instant::now())
             })),
             tracer: traces.tracer(),
         };
