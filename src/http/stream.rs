@@ -2,14 +2,12 @@
 //! channel, so that memory use stays small and a slow client slows the writer down.
 
 use std::io::{self, Write};
-use std::pin::Pin;
 use std::sync::Arc;
-use std::task::{Context, Poll};
 use std::time::Instant;
 
 use axum::body::Body;
 use bytes::{BufMut as _, Bytes, BytesMut};
-use hyper::body::{Body as HttpBody, Frame, SizeHint};
+use futures_util::stream;
 use metrics::histogram;
 use tokio::sync::{mpsc, oneshot};
 
@@ -50,7 +48,15 @@ pub(super) async fn start(
     });
     // The writer has panicked; the panic hook has logged it.
     let length = answer.await.map_err(|_dropped| Problem::internal("the writer failed"))??;
-    Ok((length, Body::new(MeshBody { pieces: receiver, left: length, ended: false })))
+    let body = stream::unfold(Some(receiver), |pieces| async move {
+        let mut pieces = pieces?;
+        match pieces.recv().await {
+            Some(WriterMessage::Data(data)) => Some((Ok(data), Some(pieces))),
+            Some(WriterMessage::End) => None,
+            None => Some((Err(io::Error::other("the mesh could not be written to its end")), None)),
+        }
+    });
+    Ok((length, Body::from_stream(body)))
 }
 
 /// Plans the file, sends its length, writes it.
@@ -139,42 +145,5 @@ impl Write for Pieces {
 
     fn flush(&mut self) -> io::Result<()> {
         Ok(())
-    }
-}
-
-/// Body that receives the pieces.
-struct MeshBody {
-    pieces: mpsc::Receiver<WriterMessage>,
-    left: Option<u64>,
-    ended: bool,
-}
-
-impl HttpBody for MeshBody {
-    type Data = Bytes;
-    type Error = io::Error;
-
-    fn poll_frame(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<Option<Result<Frame<Bytes>, io::Error>>> {
-        if self.ended {
-            return Poll::Ready(None);
-        }
-        self.pieces.poll_recv(cx).map(|piece| match piece {
-            Some(WriterMessage::Data(data)) => {
-                self.left = self.left.map(|left| left.saturating_sub(data.len() as u64));
-                Some(Ok(Frame::data(data)))
-            }
-            Some(WriterMessage::End) => {
-                self.ended = true;
-                None
-            }
-            None => Some(Err(io::Error::other("the mesh could not be written to its end"))),
-        })
-    }
-
-    fn is_end_stream(&self) -> bool {
-        self.ended || self.left == Some(0)
-    }
-
-    fn size_hint(&self) -> SizeHint {
-        self.left.map_or_else(SizeHint::default, SizeHint::with_exact)
     }
 }
