@@ -1,19 +1,16 @@
 //! `…/areas`: exact areas of the atoms, residues or chains of a structure as CSV, without a mesh.
 
 use axum::body::Body;
-use axum::extract::State;
-use axum::http::header::{self, HeaderMap};
+use axum::http::header;
 use axum::response::{IntoResponse, Response};
 
 use super::document;
-use super::guard::Caller;
 use super::openapi::meshes::NotModified;
 use super::openapi::parameters::{AreaParameters, ConditionHeaders, StructurePath};
 use super::openapi::problem_responses;
 use super::parsed_request::Pairs;
 use super::problem::Problem;
-use super::source::{Loaded, StructureSource};
-use super::state::Shared;
+use super::source::{DocumentRequest, Loaded};
 use crate::jobs::Failure;
 use crate::pipeline::areas;
 use crate::pipeline::params;
@@ -32,17 +29,12 @@ problem_responses!(Problems: [READING LISTING] TooManyCopies);
         (status = 200, description = "The areas.", body = String, content_type = "text/csv", headers(("ETag"), ("Cache-Control"))),
         NotModified, Problems,
     ))]
-pub(super) async fn list(
-    State(app): State<Shared>,
-    caller: Caller,
-    source: StructureSource,
-    query: Pairs,
-    headers: HeaderMap,
-) -> Result<Response, Problem> {
+pub(super) async fn list(request: DocumentRequest, query: Pairs) -> Result<Response, Problem> {
+    let DocumentRequest { app, caller, .. } = &request;
     let AreasRequest { options, level, canonical } = params::areas::parse(&query.0)?;
     let surface = app.config.limits.job().surface;
     let write = async |loaded: Loaded, delivery| {
-        let listing = loaded.list_atoms(&app, &caller, delivery, move |structure, limits, control, memory| {
+        let listing = loaded.list_atoms(app, caller, delivery, move |structure, limits, control, memory| {
             let refused = |error| Problem::from(Failure::Job { error, diagnostics: Vec::new() });
             let areas =
                 areas::measure_selection(structure, &options, limits, &surface, control).map_err(refused)?.areas;
@@ -50,5 +42,5 @@ pub(super) async fn list(
         });
         Ok(([(header::CONTENT_TYPE, "text/csv")], Body::from(listing.await?)).into_response())
     };
-    source.document(&app, &caller, &headers, &canonical, None, write).await
+    request.document(&canonical, None, write).await
 }

@@ -2,8 +2,7 @@
 //! mesh with their positions. Labels in the mesh itself would double the size of a small one.
 
 use axum::body::Body;
-use axum::extract::State;
-use axum::http::header::{self, HeaderMap};
+use axum::http::header;
 use axum::response::{IntoResponse, Response};
 use serde::{Serialize, Serializer};
 use utoipa::ToSchema;
@@ -16,7 +15,7 @@ use super::openapi::parameters::{AtomParameters, ConditionHeaders, StructurePath
 use super::openapi::problem_responses;
 use super::parsed_request::Pairs;
 use super::problem::Problem;
-use super::source::{Loaded, StructureSource};
+use super::source::{DocumentRequest, Loaded};
 use super::state::{Delivery, Shared};
 use crate::structure::{self, Selected, Structure, element};
 use crate::surface::{MemoryMeter, OutOfMemory, Reservation};
@@ -111,17 +110,11 @@ problem_responses!(Problems: [READING LISTING] TooManyCopies);
         (status = 200, description = "The atoms.", body = AtomsDocument, headers(("ETag"), ("Cache-Control"))),
         NotModified, Problems,
     ))]
-pub(super) async fn list(
-    State(app): State<Shared>,
-    caller: Caller,
-    source: StructureSource,
-    query: Pairs,
-    headers: HeaderMap,
-) -> Result<Response, Problem> {
+pub(super) async fn list(request: DocumentRequest, query: Pairs) -> Result<Response, Problem> {
     let positions = atom_parameters::parse(&query.0)?;
     let variant = positions.as_ref().map_or_else(String::new, |positions| positions.canonical.clone());
-    let write = async |loaded, delivery| write_list(&app, &caller, loaded, delivery, positions).await;
-    source.document(&app, &caller, &headers, &variant, None, write).await
+    let write = async |loaded, delivery| write_list(&request.app, &request.caller, loaded, delivery, positions).await;
+    request.document(&variant, None, write).await
 }
 
 async fn write_list(

@@ -3,9 +3,7 @@
 use std::fmt::Write as _;
 
 use axum::body::Body;
-use axum::extract::State;
 use axum::http::header::{self, HeaderMap, HeaderName, HeaderValue};
-use axum::http::{Response as HttpResponse, StatusCode};
 use axum::response::{IntoResponse, Response};
 use bytes::Bytes;
 
@@ -20,8 +18,7 @@ use super::openapi::problem_responses;
 use super::parsed_request::Pairs;
 use super::problem::Problem;
 use super::problem_types::ProblemType;
-use super::range::{self, Wanted};
-use super::source::{self, Loaded, StructureSource};
+use super::source::{self, DocumentRequest, Loaded};
 use super::state::{Delivery, Shared};
 use crate::jobs::MemoryReservation;
 use crate::pipeline::{AtomColors, ColorError, Coloring, Options, params};
@@ -48,23 +45,18 @@ problem_responses!(Problems: [READING LISTING] RangeNotSatisfiable);
     params(StructurePath, ColorParameters, ConditionHeaders, RangeHeaders),
     responses(AtomColorsResponse, Problems)
 )]
-pub(super) async fn list(
-    State(app): State<Shared>,
-    caller: Caller,
-    source: StructureSource,
-    query: Pairs,
-    headers: HeaderMap,
-) -> Result<Response, Problem> {
+pub(super) async fn list(request: DocumentRequest, query: Pairs) -> Result<Response, Problem> {
+    let DocumentRequest { app, caller, headers, .. } = &request;
     let (options, coloring) = color_parameters::parse(&query.0)?;
     let variant = params::canonical(&options);
     let write = async |loaded: Loaded, delivery| {
         let etag = source::etag(&loaded.digest, &variant)?;
-        let (colors, legend) = write_list(&app, &caller, (loaded, delivery), options, coloring).await?;
+        let (colors, legend) = write_list(app, caller, (loaded, delivery), options, coloring).await?;
         let described =
             [(header::CONTENT_TYPE, HeaderValue::from_static("application/octet-stream")), (LEGEND, legend)];
-        Ok((described, part_of(&colors, &headers, &etag)?).into_response())
+        Ok((described, part_of(&colors, headers, &etag)?).into_response())
     };
-    source.document(&app, &caller, &headers, &variant, None, write).await
+    request.document(&variant, None, write).await
 }
 
 /// Lists the colours of the atoms, with their legend.
@@ -119,24 +111,10 @@ fn ascii(json: &str) -> String {
 }
 
 /// Returns a response with the list or the requested part of it.
-fn part_of(list: &Bytes, headers: &HeaderMap, etag: &HeaderValue) -> Result<HttpResponse<Body>, Problem> {
-    let length = list.len() as u64;
-    let (status, range) = match range::wanted(headers, etag, length) {
-        Wanted::All => (StatusCode::OK, 0..length),
-        Wanted::Part(range) => (StatusCode::PARTIAL_CONTENT, range),
-        Wanted::Nothing => return Err(delivery::range_outside(length)),
-    };
-    let accepted = [(header::ACCEPT_RANGES, HeaderValue::from_static("bytes"))];
-    let content_range = (status == StatusCode::PARTIAL_CONTENT)
-        .then(|| [(header::CONTENT_RANGE, delivery::content_range(&range, length))]);
-    let [from, to] = [range.start, range.end].map(|at| usize::try_from(at).unwrap_or(list.len()));
-    Ok((
-        status,
-        accepted,
-        content_range.map_or_else(HeaderMap::new, HeaderMap::from_iter),
-        Body::from(list.slice(from..to)),
-    )
-        .into_response())
+fn part_of(list: &Bytes, headers: &HeaderMap, etag: &HeaderValue) -> Result<Response, Problem> {
+    let (part, status, headers) = delivery::requested_part(headers, etag, list.len() as u64)?;
+    let [from, to] = [part.start, part.end].map(|at| usize::try_from(at).unwrap_or(list.len()));
+    Ok((status, headers, Body::from(list.slice(from..to))).into_response())
 }
 
 #[cfg(test)]

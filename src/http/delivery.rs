@@ -3,8 +3,8 @@
 use std::ops::Range;
 use std::sync::Arc;
 
-use axum::http::HeaderValue;
 use axum::http::header::{self, HeaderMap, HeaderName};
+use axum::http::{HeaderValue, StatusCode};
 use axum::response::{IntoResponse, Response};
 use serde::Serialize;
 use serde_json::Value;
@@ -14,6 +14,7 @@ use utoipa::openapi::schema::Type;
 use super::errors::{self, Finding};
 use super::problem::Problem;
 use super::problem_types::ProblemType;
+use super::range::{self, Wanted};
 use super::state::{App, Delivery};
 use super::stream;
 use super::timing::Timing;
@@ -79,16 +80,25 @@ pub(super) struct ReportDocument {
     diagnostics: Option<Vec<Finding>>,
 }
 
-/// Returns the value of `Content-Range` for a part of a file of `length` bytes.
-pub(super) fn content_range(part: &Range<u64>, length: u64) -> HeaderValue {
-    text(&format!("bytes {}-{}/{length}", part.start, part.end - 1))
-}
-
-/// Returns the problem of a range outside a file of `length` bytes.
-pub(super) fn range_outside(length: u64) -> Problem {
-    Problem::new(ProblemType::RangeNotSatisfiable, format!("the file has {length} bytes"))
-        .with("actual", length)
-        .header(header::CONTENT_RANGE, &format!("bytes */{length}"))
+/// Returns the part of a file of `length` bytes that is requested, with the status and the headers of the response.
+/// `etag` is that of the file.
+pub(super) fn requested_part(
+    request: &HeaderMap,
+    etag: &HeaderValue,
+    length: u64,
+) -> Result<(Range<u64>, StatusCode, HeaderMap), Problem> {
+    let mut headers = HeaderMap::from_iter([(header::ACCEPT_RANGES, HeaderValue::from_static("bytes"))]);
+    match range::wanted(request, etag, length) {
+        Wanted::All => Ok((0..length, StatusCode::OK, headers)),
+        Wanted::Part(part) => {
+            let content_range = text(&format!("bytes {}-{}/{length}", part.start, part.end - 1));
+            headers.insert(header::CONTENT_RANGE, content_range);
+            Ok((part, StatusCode::PARTIAL_CONTENT, headers))
+        }
+        Wanted::Nothing => Err(Problem::new(ProblemType::RangeNotSatisfiable, format!("the file has {length} bytes"))
+            .with("actual", length)
+            .header(header::CONTENT_RANGE, &format!("bytes */{length}"))),
+    }
 }
 
 /// Sends the mesh as `format`. `permit` is dropped after the last byte was written.

@@ -1,6 +1,5 @@
 //! `GET /v1/results/{key}.{ext}` and `…/{key}/report.json`: stored results, byte for byte.
 
-use std::ops::Range;
 use std::sync::{Arc, PoisonError};
 use std::time::{Duration, Instant};
 
@@ -21,7 +20,6 @@ use super::openapi::parameters::{ConditionHeaders, RangeHeaders, ResultFile, Res
 use super::openapi::problem_responses;
 use super::problem::Problem;
 use super::problem_types::ProblemType;
-use super::range::{self, Wanted};
 use super::state::{App, Shared};
 use super::timing::SERVER_TIMING;
 use super::{conditional, delivery};
@@ -143,24 +141,13 @@ pub(super) async fn stored(
     }
     let Some(headers_of_result) = result_headers(app, key, format).await? else { return Ok(None) };
     let mut out = HeaderMap::clone(&headers_of_result);
-    let wanted = match range::wanted(headers, &delivery::etag(key), meta.size) {
-        Wanted::All => None,
-        Wanted::Part(range) => Some(range),
-        Wanted::Nothing => return Err(delivery::range_outside(meta.size)),
-    };
-    let length = wanted.as_ref().map_or(meta.size, |r: &Range<u64>| r.end - r.start);
-    out.insert(header::CONTENT_LENGTH, HeaderValue::from(length));
-    let status = match &wanted {
-        Some(r) => {
-            out.insert(header::CONTENT_RANGE, delivery::content_range(r, meta.size));
-            StatusCode::PARTIAL_CONTENT
-        }
-        None => StatusCode::OK,
-    };
+    let (part, status, more) = delivery::requested_part(headers, &delivery::etag(key), meta.size)?;
+    out.extend(more);
+    out.insert(header::CONTENT_LENGTH, HeaderValue::from(part.end - part.start));
     if method == Method::HEAD {
         return Ok(Some((status, out).into_response()));
     }
-    if let Some(part) = wanted {
+    if status == StatusCode::PARTIAL_CONTENT {
         let Some((_, part)) = app.store.read(&name, Some(part)).await? else { return Ok(None) };
         body = part;
     }
@@ -190,7 +177,6 @@ async fn result_headers(app: &App, key: &ContentKey, format: Format) -> Result<O
     headers.insert(header::CONTENT_TYPE, HeaderValue::from_static(format.media_type()));
     headers.insert(header::CONTENT_DISPOSITION, delivery::disposition(report["id"].as_str(), format));
     headers.insert(header::ETAG, delivery::etag(key));
-    headers.insert(header::ACCEPT_RANGES, HeaderValue::from_static("bytes"));
     headers.insert(header::CACHE_CONTROL, IMMUTABLE);
     headers.insert(header::CONTENT_LOCATION, delivery::text(&path(key, format.name())));
     headers.insert(SERVER_TIMING, HeaderValue::from_static("cache;desc=hit"));

@@ -153,34 +153,6 @@ impl StructureSource {
             }
         }
     }
-
-    /// Returns a response with the document that `write` makes of the structure, or 304 if the client has it. `write`
-    /// holds the delivery slot of the request until its work has stopped. `job` is that of [`Self::find`]. The `ETag`
-    /// is that of [`etag`] with `variant`, the parameters of the document.
-    pub(super) async fn document<F>(
-        self,
-        app: &Shared,
-        caller: &Caller,
-        headers: &HeaderMap,
-        variant: &str,
-        options: Option<&Options>,
-        write: impl FnOnce(Loaded, Delivery) -> F,
-    ) -> Result<Response, Problem>
-    where
-        F: Future<Output = Result<Response, Problem>>,
-    {
-        let digest = self.digest(app, caller).await?;
-        let validators = validators(&digest, variant)?;
-        conditional::check_match(headers, &validators[0].1)?;
-        if conditional::is_unchanged(headers, &validators[0].1) {
-            return Ok((StatusCode::NOT_MODIFIED, validators).into_response());
-        }
-        app.admit_work(caller)?;
-        let delivery = app.delivery(caller.client)?;
-        let loaded = self.find(app, caller, &digest, options).await?;
-        let validators = self::validators(&loaded.digest, variant)?;
-        Ok((validators, write(loaded, delivery).await?).into_response())
-    }
 }
 
 /// Reads the structure from the path: `{id}` is a PDB id, `{digest}` that of a stored structure.
@@ -195,6 +167,53 @@ impl FromRequestParts<Shared> for StructureSource {
             _ => None,
         });
         sources.next().unwrap_or_else(|| Err(Problem::internal("the path names no structure")))
+    }
+}
+
+/// Request for a document of a structure.
+pub(super) struct DocumentRequest {
+    pub(super) app: Shared,
+    pub(super) caller: Caller,
+    pub(super) headers: HeaderMap,
+    source: StructureSource,
+}
+
+/// Reads the request; its path names the structure.
+impl FromRequestParts<Shared> for DocumentRequest {
+    type Rejection = Problem;
+
+    async fn from_request_parts(parts: &mut Parts, app: &Shared) -> Result<Self, Problem> {
+        let source = StructureSource::from_request_parts(parts, app).await?;
+        let (caller, headers) = (Caller::of(&parts.extensions), parts.headers.clone());
+        Ok(Self { app: Arc::clone(app), caller, headers, source })
+    }
+}
+
+impl DocumentRequest {
+    /// Returns a response with the document that `write` makes of the structure, or 304 if the client has it. `write`
+    /// holds the delivery slot of the request until its work has stopped. `options` are those of
+    /// [`StructureSource::find`]. The `ETag` is that of [`etag`] with `variant`, the parameters of the document.
+    pub(super) async fn document<F>(
+        &self,
+        variant: &str,
+        options: Option<&Options>,
+        write: impl FnOnce(Loaded, Delivery) -> F,
+    ) -> Result<Response, Problem>
+    where
+        F: Future<Output = Result<Response, Problem>>,
+    {
+        let Self { app, caller, headers, source } = self;
+        let digest = source.digest(app, caller).await?;
+        let validators = validators(&digest, variant)?;
+        conditional::check_match(headers, &validators[0].1)?;
+        if conditional::is_unchanged(headers, &validators[0].1) {
+            return Ok((StatusCode::NOT_MODIFIED, validators).into_response());
+        }
+        app.admit_work(caller)?;
+        let delivery = app.delivery(caller.client)?;
+        let loaded = source.find(app, caller, &digest, options).await?;
+        let validators = self::validators(&loaded.digest, variant)?;
+        Ok((validators, write(loaded, delivery).await?).into_response())
     }
 }
 

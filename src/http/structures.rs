@@ -22,7 +22,7 @@ use super::openapi::parameters::{
 use super::openapi::problem_responses;
 use super::problem::Problem;
 use super::problem_types::ProblemType;
-use super::source::{Loaded, StructureSource};
+use super::source::{DocumentRequest, Loaded};
 use super::state::{Delivery, Shared};
 use super::{delivery, upload};
 use crate::jobs::Failure;
@@ -176,14 +176,10 @@ pub(super) async fn create(
         (status = 200, description = "Contents of the structure.", body = StructureDocument, headers(("ETag"), ("Cache-Control"))),
         NotModified, ShowProblems,
     ))]
-pub(super) async fn show(
-    State(app): State<Shared>,
-    caller: Caller,
-    source: StructureSource,
-    headers: HeaderMap,
-) -> Result<Response, Problem> {
-    let write = async |loaded, delivery| Ok(Json(summarize(&app, &caller, loaded, delivery).await?).into_response());
-    source.document(&app, &caller, &headers, "", None, write).await
+pub(super) async fn show(request: DocumentRequest) -> Result<Response, Problem> {
+    let DocumentRequest { app, caller, .. } = &request;
+    let write = async |loaded, delivery| Ok(Json(summarize(app, caller, loaded, delivery).await?).into_response());
+    request.document("", None, write).await
 }
 
 /// Mesh an uploaded structure

@@ -7,17 +7,16 @@ use std::sync::Arc;
 
 use axum::body::Body;
 use axum::extract::FromRequestParts;
-use axum::http::header::{self, HeaderMap};
+use axum::http::header;
 use axum::http::request::Parts;
 use axum::response::{IntoResponse, Response};
 
-use super::guard::Caller;
 use super::openapi::meshes::NotModified;
 use super::openapi::parameters::{ConditionHeaders, StructurePath, SubtreeParameters, TilesetParameters};
 use super::openapi::problem_responses;
 use super::parsed_request::{Pairs, parse_address};
 use super::problem::Problem;
-use super::source::{Loaded, StructureSource};
+use super::source::{DocumentRequest, Loaded};
 use super::state::{Delivery, Shared};
 use crate::formats::Compress;
 use crate::formats::tileset::{TileAddress, TilesetUris, assembly_document, subtree, tileset_document};
@@ -62,10 +61,7 @@ pub(super) async fn show_subtree(request: TilesetRequest) -> Result<Response, Pr
 
 /// Request for a document of a tileset.
 pub(super) struct TilesetRequest {
-    app: Shared,
-    caller: Caller,
-    source: StructureSource,
-    headers: HeaderMap,
+    request: DocumentRequest,
     /// Parameters of the tiles, without `tile`.
     pairs: Vec<(String, String)>,
     options: Options,
@@ -87,16 +83,8 @@ impl FromRequestParts<Shared> for TilesetRequest {
         }
         app.accepts(&request.options)?;
         pairs.retain(|(name, _)| name != "tile");
-        let caller = Caller::of(&parts.extensions);
-        let source = StructureSource::from_request_parts(parts, app).await?;
-        Ok(Self {
-            app: Arc::clone(app),
-            caller,
-            source,
-            headers: parts.headers.clone(),
-            pairs,
-            options: request.options,
-        })
+        let options = request.options;
+        Ok(Self { request: DocumentRequest::from_request_parts(parts, app).await?, pairs, options })
     }
 }
 
@@ -167,20 +155,21 @@ impl TilesetRequest {
         media_type: &'static str,
         write: impl FnOnce(&Preparation<'_>) -> Result<Vec<u8>, Problem> + Send + 'static,
     ) -> Result<Response, Problem> {
-        let Self { app, caller, source, headers, options, .. } = self;
+        let Self { request, options, .. } = self;
+        let DocumentRequest { app, caller, .. } = &request;
         let variant = format!("{media_type}\n{}", params::canonical(&options));
         // Finds the tileset in the cache, as jobs on its tiles do.
         let of_tile = Options { tile: Some(TileAddress::ROOT), ..options.clone() };
         let made = async |loaded: Loaded, delivery: Delivery| {
             let Loaded { input, digest, reservation } = loaded;
-            let (shared, key) = (Arc::clone(&app), (caller.namespace, digest));
-            let made = app.read(&caller, (reservation, delivery), move |control| {
+            let (shared, key) = (Arc::clone(app), (caller.namespace, digest));
+            let made = app.read(caller, (reservation, delivery), move |control| {
                 let limits = shared.config.limits.job().read;
                 write(&Preparation { app: &shared, key, input: &input, options: &options, limits, control })
             });
             Ok(([(header::CONTENT_TYPE, media_type)], Body::from(made.await??)).into_response())
         };
-        source.document(&app, &caller, &headers, &variant, Some(&of_tile), made).await
+        request.document(&variant, Some(&of_tile), made).await
     }
 }
 
