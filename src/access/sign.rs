@@ -210,8 +210,8 @@ fn only<'a>(parameters: &[&'a str], name: &str) -> Option<&'a str> {
 
 /// Returns the path that a signature of `path` covers: for the events and the result of a job, that of the job.
 fn covered(path: &str) -> &str {
-    let of_job = path.strip_prefix(JOBS).and_then(|rest| rest.split_once('/'));
-    match of_job {
+    let job_path = path.strip_prefix(JOBS).and_then(|rest| rest.split_once('/'));
+    match job_path {
         Some((id, "events" | "result")) => &path[..JOBS.len() + id.len()],
         _ => path,
     }

@@ -252,7 +252,7 @@ impl ArchiveState {
             Ok(Answer::Unchanged) => "unchanged",
             Ok(_) => "found",
             Err(FetchError::NotFound { .. }) => "absent",
-            Err(FetchError::TooLarge { .. }) => "too-large",
+            Err(FetchError::TooLarge(_)) => "too-large",
             Err(FetchError::Memory { .. }) => "no-memory",
             Err(FetchError::Busy { .. }) => "busy",
             Err(_) => "unavailable",

@@ -7,7 +7,7 @@ use std::time::Duration;
 use thiserror::Error;
 
 use crate::structure::{ArchiveError, EntryId};
-use crate::surface::OutOfMemory;
+use crate::surface::{Exceeded, OutOfMemory};
 
 /// Errors of fetching an entry.
 #[derive(Debug, Clone, Error)]
@@ -22,15 +22,8 @@ pub enum FetchError {
     #[error(transparent)]
     Local(Arc<ArchiveError>),
     /// The file of the remote archive is too large.
-    #[error("the archive's file of entry {id} exceeds {limit} bytes")]
-    TooLarge {
-        /// Requested entry.
-        id: EntryId,
-        /// Announced size, bytes, if any.
-        bytes: Option<u64>,
-        /// Maximum size, bytes.
-        limit: u64,
-    },
+    #[error(transparent)]
+    TooLarge(Box<Exceeded>),
     /// The remote archive is unavailable, and there is no copy.
     #[error("the archive at {host} {reason}")]
     Unavailable {

@@ -15,6 +15,7 @@ use crate::config::{ArchiveConfig, Config, Template};
 use crate::memory_budget::Budget;
 use crate::readers::{Busy, Readers};
 use crate::structure::EntryId;
+use crate::surface::{Exceeded, Limit};
 use crate::telemetry::{SpanKind, SpanParent, TraceSpan};
 
 /// Longest pause that a host can request.
@@ -95,7 +96,7 @@ impl Remote {
             match self.fetch_from(id, template, breaker, copy, deadline).await {
                 Ok(Answer::Absent) => {}
                 Ok(answer) => return Ok(answer),
-                Err(error @ (FetchError::TooLarge { .. } | FetchError::Memory { .. } | FetchError::Busy { .. })) => {
+                Err(error @ (FetchError::TooLarge(_) | FetchError::Memory { .. } | FetchError::Busy { .. })) => {
                     return Err(error);
                 }
                 // A later URL may have the entry. If none has, this failure is reported instead of "not found".
@@ -120,8 +121,10 @@ impl Remote {
         loop {
             let (reason, requested, detail) = match self.attempt(id, template, breaker, copy, deadline).await {
                 Ok(answer) => return Ok(answer),
-                Err(Failed::TooLarge(bytes)) => {
-                    return Err(FetchError::TooLarge { id: id.clone(), bytes, limit: self.config.max_bytes });
+                Err(Failed::TooLarge(actual)) => {
+                    let subject = format!("the archive's file of entry {id}").into();
+                    let error = Exceeded::new(Limit::EntryBytes, self.config.max_bytes);
+                    return Err(FetchError::TooLarge(Exceeded { subject, actual, ..error }.into()));
                 }
                 Err(Failed::Memory(error)) => return Err(FetchError::Memory { id: id.clone(), error }),
                 Err(Failed::Busy(Busy { wait })) => {

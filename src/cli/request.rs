@@ -3,7 +3,7 @@
 use std::path::Path;
 use std::str::FromStr as _;
 
-use molmesh::formats::{Compress, Format};
+use molmesh::formats::Format;
 use molmesh::pipeline::params::areas::AreasRequest;
 use molmesh::pipeline::params::{self, ParamError, Request};
 use molmesh::pipeline::{JobLimits, Options, tileset};
@@ -52,9 +52,7 @@ fn format_of(output: &Path) -> Result<Format, CliError> {
 
 /// Parses the flags of `tileset`.
 pub(super) fn parse_tileset(args: &TilesetArgs) -> Result<Request, CliError> {
-    let compress = ("compress".to_owned(), Compress::Meshopt.name().to_owned());
-    let request = parse(&[compress], &args.job, Format::Glb)?;
-    tileset::check(&request.options)?;
+    let request = params::parse_tileset(&mut pairs(&[], &args.job))?;
     if args.scratch.is_some() {
         tileset::check_stream(&request.options, args.inputs.len())?;
         if request.strict {
@@ -79,9 +77,13 @@ pub(super) fn parse_render(args: &RenderArgs) -> Result<Request, CliError> {
 }
 
 fn parse(own: &[(String, String)], args: &JobArgs, format: Format) -> Result<Request, CliError> {
+    params::parse_with(pairs(own, args), |_| Ok(format))
+}
+
+/// Returns names and values of the parameters of a job as in a query.
+fn pairs(own: &[(String, String)], args: &JobArgs) -> Vec<(String, String)> {
     let JobArgs { check, surface, color, atoms, parts, .. } = args;
-    let pairs = [own, &check.0, &surface.0, &color.0, &atom_pairs(atoms), &parts.0].concat();
-    params::parse_with(pairs, |_| Ok(format))
+    [own, &check.0, &surface.0, &color.0, &atom_pairs(atoms), &parts.0].concat()
 }
 
 /// Returns names and values of the atoms as in a query.

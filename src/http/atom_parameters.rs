@@ -21,8 +21,8 @@ pub(super) struct Positions {
 /// Returns a [`ParamError`], including if atoms are selected without positions.
 pub(super) fn parse(pairs: &[(String, String)]) -> Result<Option<Positions>, ParamError> {
     params::check_names(pairs, &NAMES)?;
-    let (own, of_mesh): (Vec<_>, Vec<_>) = pairs.iter().partition(|(name, _)| name == POSITIONS);
-    let job = params::parse(of_mesh.iter().map(|(name, value)| (name, value)))?.options;
+    let (own, mesh_pairs): (Vec<_>, Vec<_>) = pairs.iter().partition(|(name, _)| name == POSITIONS);
+    let job = params::parse(mesh_pairs.iter().map(|(name, value)| (name, value)))?.options;
     let positions = match &own[..] {
         [] => false,
         [(_, value)] => match value.as_str() {

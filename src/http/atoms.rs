@@ -192,11 +192,11 @@ fn document<'a>(
 
 /// Returns the coordinates of the selected atoms, with their copies, in Å, rounded to 0.001 Å.
 fn positions(structure: &Structure, selected: &Selected) -> [Vec<f64>; 3] {
-    let of_file = |row: usize| {
+    let position = |row: usize| {
         let i = selected.atoms[row] as usize;
         [structure.x[i], structure.y[i], structure.z[i]]
     };
-    let mut all: Vec<[f64; 3]> = (0..selected.atoms.len()).map(of_file).collect();
+    let mut all: Vec<[f64; 3]> = (0..selected.atoms.len()).map(position).collect();
     for copy in &selected.copies {
         all[copy.rows.clone()].iter_mut().for_each(|place| *place = copy.operator.apply(*place));
     }

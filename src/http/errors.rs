@@ -2,6 +2,7 @@
 
 mod inputs;
 
+use std::fmt::Display;
 use std::time::Duration;
 
 use serde::Serialize;
@@ -65,6 +66,11 @@ pub(super) fn format_problem(error: &FormatError, resolution: f64) -> Problem {
     }
 }
 
+/// Returns the message of an error, with the configuration key of its limit.
+fn with_key(error: &impl Display, limit: Limit) -> String {
+    format!("{error} ({})", limit.row().key.unwrap_or_default())
+}
+
 impl From<&Exceeded> for Problem {
     fn from(error: &Exceeded) -> Self {
         let row = error.limit.row();
@@ -105,17 +111,22 @@ impl From<ParamError> for Problem {
 
 impl From<OutOfMemory> for Problem {
     fn from(error: OutOfMemory) -> Self {
-        let full = || Self::new(ProblemType::MemoryFull, error.to_string()).retry_after(Duration::from_secs(1));
+        let busy = |kind, detail| Self::new(kind, detail).retry_after(Duration::from_secs(1));
         match error {
-            OutOfMemory::Budget { held, limit, .. } => full().with("limit", limit).with("actual", held),
-            OutOfMemory::Share { limit, held, .. } => Self::new(ProblemType::ShareExceeded, error.to_string())
-                .with("limit", limit)
-                .with("actual", held)
-                .retry_after(Duration::from_secs(1)),
-            OutOfMemory::Limit { needed, limit } => {
-                Self::new(ProblemType::TooMuchMemory, error.to_string()).with("limit", limit).with("actual", needed)
+            OutOfMemory::Budget { held, limit, .. } => {
+                busy(ProblemType::MemoryFull, with_key(&error, Limit::MemoryBytes))
+                    .with("limit", limit)
+                    .with("actual", held)
             }
-            OutOfMemory::System { .. } => full(),
+            OutOfMemory::Share { limit, held, .. } => {
+                busy(ProblemType::ShareExceeded, format!("{error} (server.client_share)"))
+                    .with("limit", limit)
+                    .with("actual", held)
+            }
+            OutOfMemory::Limit { needed, limit } => {
+                Self::from(&Exceeded { actual: Some(needed), ..Exceeded::new(Limit::MemoryBytes, limit) })
+            }
+            OutOfMemory::System { .. } => busy(ProblemType::MemoryFull, error.to_string()),
         }
     }
 }
@@ -208,9 +219,7 @@ impl From<StoreError> for Problem {
     fn from(error: StoreError) -> Self {
         let wait = Duration::from_secs(5);
         match error {
-            StoreError::TooLarge { bytes, max_bytes } => {
-                Self::new(ProblemType::BodyTooLarge, error.to_string()).with("actual", bytes).with("limit", max_bytes)
-            }
+            StoreError::TooLarge(error) => Self::from(&*error),
             StoreError::Full { held, max_bytes, .. } => Self::new(ProblemType::StoreFull, error.to_string())
                 .with("actual", held)
                 .with("limit", max_bytes)
@@ -219,9 +228,7 @@ impl From<StoreError> for Problem {
                 tracing::error!(%error, "the disk of the store is full");
                 Self::new(ProblemType::StoreFull, "the disk of the store is full").retry_after(wait)
             }
-            StoreError::TooManyRecords { limit, .. } => {
-                Self::new(ProblemType::TooManyJobs, error.to_string()).with("limit", limit).retry_after(wait)
-            }
+            StoreError::TooManyRecords(error) => Self::from(&*error).retry_after(wait),
             StoreError::Quarantined { .. } => {
                 Self::new(ProblemType::RecordUnreadable, "the record of the job is damaged and in quarantine")
             }

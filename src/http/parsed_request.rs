@@ -116,18 +116,25 @@ impl ParsedRequest {
 /// Parses the parameters of an address that ends in `surface.{ext}` (`file`), or in `report.json` (`None`).
 pub(super) fn parse_address(file: Option<&str>, pairs: &[(String, String)]) -> Result<Request, Problem> {
     let named = file.map(format_of).transpose()?;
-    if let Some(named) = named
-        && let Some((_, value)) = pairs.iter().find(|(name, _)| name == "format")
-        && Format::ALL.iter().any(|format| format.name() == value)
-    {
-        let detail = format!("parameter `format`: the path already names {}", named.name());
-        return Err(Problem::new(ProblemType::BadParameter, detail)
-            .with("parameter", "format")
-            .with("value", value.as_str())
-            .with("expected", format!("no value here, or the path surface.{value}")));
+    if let Some(named) = named {
+        reject_format(named, pairs)?;
     }
     let format = |_: &_| Ok::<_, Problem>(named.unwrap_or_default());
     params::parse_with(pairs.iter().map(|(n, v)| (n, v)), format)
+}
+
+/// Rejects the parameter `format` in an address whose path already names a format.
+pub(super) fn reject_format(named: Format, pairs: &[(String, String)]) -> Result<(), Problem> {
+    match pairs.iter().find(|(name, _)| name == "format") {
+        Some((_, value)) if Format::ALL.iter().any(|format| format.name() == value) => {
+            let detail = format!("parameter `format`: the path already names {}", named.name());
+            Err(Problem::new(ProblemType::BadParameter, detail)
+                .with("parameter", "format")
+                .with("value", value.as_str())
+                .with("expected", format!("no value here, or the path surface.{value}")))
+        }
+        _ => Ok(()),
+    }
 }
 
 /// Returns the format that `surface.{ext}` names.

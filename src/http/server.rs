@@ -222,10 +222,10 @@ impl Server {
         let serving = tokio::spawn(serving);
         let mut recorder = None;
         if let Some((listener, address)) = self.metrics_listener {
-            let of_process = telemetry::recorder()?;
-            let router = metrics::router(of_process.clone(), Sites::for_metrics(&self.app.config, address));
+            let process_recorder = telemetry::recorder()?;
+            let router = metrics::router(process_recorder.clone(), Sites::for_metrics(&self.app.config, address));
             background.spawn(accept::serve(listener, router, config, Budget::unlimited(), stopped).map(drop));
-            recorder = Some(of_process);
+            recorder = Some(process_recorder);
         }
         background.spawn(publish(Arc::clone(&self.app), recorder));
         stop::reached(&mut orders, Stop::Notice).await;

@@ -248,10 +248,7 @@ fn archive_problem(error: &FetchError) -> Problem {
     match error {
         FetchError::NotFound { .. } => Problem::new(ProblemType::NotInArchive, detail),
         FetchError::Local(error) => folder_problem(error),
-        FetchError::TooLarge { bytes, limit, .. } => {
-            let problem = Problem::new(ProblemType::EntryTooLarge, detail).with("limit", *limit);
-            bytes.iter().fold(problem, |problem, bytes| problem.with("actual", *bytes))
-        }
+        FetchError::TooLarge(error) => Problem::from(&**error),
         FetchError::Unavailable { host, reason, retry_after } => {
             let problem = Problem::new(ProblemType::ArchiveUnavailable, detail).with("host", host.as_str());
             let problem = match reason {
@@ -281,9 +278,7 @@ fn folder_problem(error: &ArchiveError) -> Problem {
             .with("parameter", "id")
             .with("value", id.as_str())
             .with("expected", "a PDB id such as 4pti or pdb_00004pti"),
-        ArchiveError::TooLarge { bytes, limit, .. } => {
-            Problem::new(ProblemType::InflatedTooLarge, detail).with("limit", *limit).with("actual", *bytes)
-        }
+        ArchiveError::Limit(error) => Problem::from(&**error),
         ArchiveError::Io(io) => Problem::internal(format!("{error}: {io}")),
     }
 }

@@ -14,16 +14,16 @@ use axum::response::{IntoResponse, Response};
 use super::openapi::meshes::NotModified;
 use super::openapi::parameters::{ConditionHeaders, StructurePath, SubtreeParameters, TilesetParameters};
 use super::openapi::problem_responses;
-use super::parsed_request::{Pairs, parse_address};
+use super::parsed_request::{Pairs, reject_format};
 use super::problem::Problem;
 use super::source::{DocumentRequest, Loaded};
 use super::state::{Delivery, Shared};
-use crate::formats::Compress;
+use crate::formats::Format;
 use crate::formats::tileset::{TileAddress, TilesetUris, assembly_document, subtree, tileset_document};
 use crate::jobs::{CacheKey, Failure, Input, SharedStructure, SharedTileset};
 use crate::pipeline::params::ParamError;
 use crate::pipeline::tileset::AssemblyTileset;
-use crate::pipeline::{JobError, Options, StageClock, params, tileset};
+use crate::pipeline::{JobError, Options, StageClock, params};
 use crate::structure::ReadLimits;
 use crate::surface::{Control, SurfaceError};
 
@@ -72,11 +72,8 @@ impl FromRequestParts<Shared> for TilesetRequest {
 
     async fn from_request_parts(parts: &mut Parts, app: &Shared) -> Result<Self, Problem> {
         let Pairs(mut pairs) = Pairs::from_request_parts(parts, app).await?;
-        if pairs.iter().all(|(name, _)| name != "compress") {
-            pairs.push(("compress".to_owned(), Compress::Meshopt.name().to_owned()));
-        }
-        let request = parse_address(Some("surface.glb"), &pairs)?;
-        tileset::check(&request.options)?;
+        reject_format(Format::Glb, &pairs)?;
+        let request = params::parse_tileset(&mut pairs)?;
         if request.strict {
             let expected = "no value for a tileset; POST /v1/report checks a file".to_owned();
             return Err(ParamError::BadValue { name: "check", value: "`strict`".to_owned(), expected }.into());
@@ -159,7 +156,7 @@ impl TilesetRequest {
         let DocumentRequest { app, caller, .. } = &request;
         let variant = format!("{media_type}\n{}", params::canonical(&options));
         // Finds the tileset in the cache, as jobs on its tiles do.
-        let of_tile = Options { tile: Some(TileAddress::ROOT), ..options.clone() };
+        let tile_options = Options { tile: Some(TileAddress::ROOT), ..options.clone() };
         let made = async |loaded: Loaded, delivery: Delivery| {
             let Loaded { input, digest, reservation } = loaded;
             let (shared, key) = (Arc::clone(app), (caller.namespace, digest));
@@ -169,7 +166,7 @@ impl TilesetRequest {
             });
             Ok(([(header::CONTENT_TYPE, media_type)], Body::from(made.await??)).into_response())
         };
-        request.document(&variant, Some(&of_tile), made).await
+        request.document(&variant, Some(&tile_options), made).await
     }
 }
 

@@ -32,19 +32,15 @@ pub(crate) enum SaveError {
 impl From<StoreError> for SaveError {
     fn from(error: StoreError) -> Self {
         match error {
-            StoreError::TooLarge { bytes, max_bytes } => Self::too_large(bytes, max_bytes),
+            StoreError::TooLarge(error) => {
+                Self::Format(Exceeded { actual: error.actual, ..Exceeded::new(Limit::ResultBytes, error.max) }.error())
+            }
             error => Self::Store(error),
         }
     }
 }
 
 impl SaveError {
-    /// Returns the error for a file of more than `limit` bytes.
-    fn too_large(bytes: u64, limit: u64) -> Self {
-        let error = Exceeded { actual: Some(bytes), ..Exceeded::new(Limit::FileBytes, limit) };
-        Self::Format(error.error())
-    }
-
     /// Returns true if a later attempt may succeed.
     pub(crate) fn is_temporary(&self) -> bool {
         matches!(self, Self::Store(error) if error.is_temporary())
@@ -152,7 +148,8 @@ pub(crate) async fn save(
         let file = finished.product.file(format)?;
         let bytes = file.bytes_bound();
         if bytes > limit {
-            return Err(SaveError::too_large(bytes, limit));
+            let error = Exceeded { actual: Some(bytes), ..Exceeded::new(Limit::FileBytes, limit) };
+            return Err(SaveError::Format(error.error()));
         }
         let write = || {
             let mut writer = Hashing { writer: writing.writer(&name), hasher: Hasher::default(), bytes: 0 };

@@ -112,7 +112,7 @@ impl Structures {
         let reservation = Arc::new(self.budget.reservation());
         // Such as the file, and the memory for drawing.
         reservation.also_held(control.memory.budget().map_or(0, |[_, held]| held));
-        let charged = Control { memory: Arc::<MemoryReservation>::clone(&reservation), ..control.clone() };
+        let charged = control.with_memory(&reservation);
         let structure = structure::read_with(file, limits, &charged)?;
         reservation.grow(OVERHEAD)?;
         let read = self.charged(structure, input, reservation);
@@ -140,8 +140,8 @@ impl Structures {
         clock: &StageClock<'_>,
     ) -> Result<(SharedTileset, Option<SharedColors>), JobError> {
         let as_tileset = |kept: Kept| if let Kept::Tileset(tileset) = kept { Some(tileset) } else { None };
-        let [of_memory, of_disk] = [tileset_digest(&digest, options), streamed_digest(&digest, options)];
-        let keys = [of_memory, of_disk].map(|digest| (namespace, digest));
+        let [memory_digest, disk_digest] = [tileset_digest(&digest, options), streamed_digest(&digest, options)];
+        let keys = [memory_digest, disk_digest].map(|digest| (namespace, digest));
         let in_memory = |limits: &ReadLimits| {
             let read = |control: &Control<'_>| self.get(namespace, digest, input, limits, control);
             let prepare = |control: &Control<'_>| Tileset::new(read, options, limits, control, clock);
@@ -180,9 +180,9 @@ impl Structures {
             Input::Tileset(tileset) => tileset.clone(),
             _ => self.found_or_made(&keys, control, as_tileset, make)?,
         };
-        let of_tileset = if tileset.is_streamed() { of_disk } else { of_memory };
+        let prepared_digest = if tileset.is_streamed() { disk_digest } else { memory_digest };
         let Some(coloring) = options.color else { return Ok((tileset, None)) };
-        let key = (namespace, Digest::of(format!("colors\n{of_tileset}\n{}", coloring.canonical()).as_bytes()));
+        let key = (namespace, Digest::of(format!("colors\n{prepared_digest}\n{}", coloring.canonical()).as_bytes()));
         let prepare = |control: &Control<'_>| tileset.colors(coloring, control);
         let as_colors = |kept: Kept| if let Kept::Colors(colors) = kept { Some(colors) } else { None };
         let budget = self.budget.part(self.limit);
@@ -256,7 +256,7 @@ impl Structures {
         let limit = self.limit;
         let too_large = || SurfaceError::from(Box::new(Exceeded::new(Limit::TilesetBytes, limit))).into();
         let reservation = Arc::new(budget.reservation());
-        let charged = Control { memory: Arc::<MemoryReservation>::clone(&reservation), ..control.clone() };
+        let charged = control.with_memory(&reservation);
         let value = prepare(&charged).map_err(|error| match error {
             JobError::Surface(SurfaceError::Memory(
                 OutOfMemory::Limit { limit: of, .. } | OutOfMemory::Budget { limit: of, .. },

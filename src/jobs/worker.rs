@@ -193,7 +193,7 @@ fn check(shared: &WorkerContext, task: &Task, control: &Control<'_>) -> Result<V
     // The job notes its file when it reads it.
     let memory = shared.settings.budget.for_client(task.rank.client.0).reservation();
     memory.also_held(control.memory.budget().map_or(0, |[_, held]| held).saturating_add(input_bytes(task)));
-    let control = Control { memory: Arc::new(memory), ..control.clone() };
+    let control = control.with_memory(&Arc::new(memory));
     let diagnostics = strict_validator::check(file, &shared.settings.limits.read, &control).map_err(JobError::from)?;
     if diagnostics.iter().any(|d| d.level == Level::Error) {
         return Err(Failure::Check { diagnostics });

@@ -7,6 +7,7 @@ use thiserror::Error;
 
 use super::digest::Digest;
 use super::name::BadName;
+use crate::surface::Exceeded;
 
 /// Errors of the store. Each names the location concerned.
 #[derive(Debug, Clone, Error)]
@@ -22,13 +23,8 @@ pub enum StoreError {
         reason: String,
     },
     /// The object is larger than the capacity of the store.
-    #[error("{bytes} bytes exceed the capacity of the store, {max_bytes} bytes (store.max_bytes)")]
-    TooLarge {
-        /// Size of the object, bytes, as far as known.
-        bytes: u64,
-        /// Capacity of the store, bytes.
-        max_bytes: u64,
-    },
+    #[error("{}", .0.message(.0.key()))]
+    TooLarge(Box<Exceeded>),
     /// The store is full, and all its objects are in use.
     #[error("no space for {bytes} bytes: objects in use take {held} of {max_bytes} bytes (store.max_bytes)")]
     Full {
@@ -91,13 +87,8 @@ pub enum StoreError {
         digest: Digest,
     },
     /// The limit of jobs on record is reached, and all of them are open.
-    #[error("{limit} jobs {scope} are on record, and none of them has ended")]
-    TooManyRecords {
-        /// Largest number of jobs on record.
-        limit: usize,
-        /// Jobs that the limit counts.
-        scope: &'static str,
-    },
+    #[error("{}", .0.message(.0.key()))]
+    TooManyRecords(Box<Exceeded>),
     /// The name is invalid.
     #[error(transparent)]
     Name(#[from] BadName),
@@ -147,7 +138,7 @@ impl From<StoreError> for io::Error {
     fn from(error: StoreError) -> Self {
         let kind = match error {
             StoreError::NoSpace { .. } | StoreError::Full { .. } => io::ErrorKind::StorageFull,
-            StoreError::TooLarge { .. } => io::ErrorKind::FileTooLarge,
+            StoreError::TooLarge(_) => io::ErrorKind::FileTooLarge,
             StoreError::Denied { .. } => io::ErrorKind::PermissionDenied,
             _ => io::ErrorKind::Other,
         };

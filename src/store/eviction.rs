@@ -11,6 +11,7 @@ use super::index::{EvictionCandidate, ReserveError};
 use super::name::{Folder, Name};
 use super::object::Usage;
 use super::stale::STALE;
+use crate::surface::{Exceeded, Limit};
 use crate::telemetry::{STORE_REMOVED, shorten};
 
 /// Attempts to free space. Other requests may use the candidates or take the freed space in between.
@@ -125,7 +126,8 @@ impl Store {
         let (cap, max_bytes) = (self.capacity(), self.0.config.max_bytes);
         let bytes = had.saturating_add(more);
         if bytes > max_bytes {
-            return Err(StoreError::TooLarge { bytes, max_bytes });
+            let error = Exceeded { actual: Some(bytes), ..Exceeded::new(Limit::StoreBytes, max_bytes) };
+            return Err(StoreError::TooLarge(error.into()));
         }
         if self.index().reserve(more, cap).is_ok() {
             return Ok(());

@@ -7,6 +7,7 @@ use super::error::StoreError;
 use super::handle::Store;
 use super::index::{EvictionCandidate, Use};
 use super::name::Name;
+use crate::surface::{Exceeded, Limit};
 
 /// Jobs that share a cap: those of one client, see [`Name::owner`], or all.
 pub(super) type Scope = Option<u32>;
@@ -117,9 +118,11 @@ impl Store {
                     return Ok((RecordReservation { store: self.clone(), name: name.clone() }, removed));
                 }
                 Admission::Full(scope, limit) => {
-                    let scope =
-                        if scope.is_some() { "of the client (jobs.records_per_client)" } else { "of all clients" };
-                    return Err(StoreError::TooManyRecords { limit, scope });
+                    let mut error = Exceeded::new(Limit::JobRecords, limit as u64);
+                    if scope.is_none() {
+                        (error.subject, error.is_fixed) = ("the service".into(), true);
+                    }
+                    return Err(StoreError::TooManyRecords(error.into()));
                 }
                 Admission::Remove(candidate) => {
                     if self.evict_record(&candidate).await? {

@@ -6,7 +6,7 @@ use std::fmt::Write;
 use std::ops::Deref;
 
 use molmesh::formats::tileset::{TileAddress, assembly_document};
-use molmesh::pipeline::tileset::{AssemblyTileset, Tileset, check};
+use molmesh::pipeline::tileset::{AssemblyTileset, Tileset};
 use molmesh::pipeline::{Choice, JobError, JobLimits, Options, StageClock, params, run};
 use molmesh::structure::{self, ReadLimits, Structure};
 use molmesh::surface::{Control, CpuBackend, Limit, Measures, Mesh, SurfaceError, SurfaceLimits, Validation};
@@ -45,9 +45,15 @@ fn tileset(pairs: &[(&str, &str)]) -> Prepared {
     tileset_of(SAMPLE, pairs)
 }
 
+/// Returns the parameters of tiles that are not compressed.
+fn tileset_options(pairs: &[(&str, &str)]) -> Options {
+    let pairs = pairs.iter().chain(&[("compress", "none")]);
+    let mut pairs = pairs.map(|(name, value)| ((*name).to_owned(), (*value).to_owned())).collect();
+    params::parse_tileset(&mut pairs).unwrap().options
+}
+
 fn tileset_of(file: &[u8], pairs: &[(&str, &str)]) -> Prepared {
-    let options = params::parse(pairs.iter().copied()).unwrap().options;
-    check(&options).unwrap();
+    let options = tileset_options(pairs);
     let read = |control: &Control<'_>| structure::read_with(file, &ReadLimits::default(), control).map(Box::new);
     let tileset =
         Tileset::new(read, &options, &ReadLimits::default(), &Control::default(), &StageClock::new(&())).unwrap();
@@ -169,8 +175,7 @@ fn an_assembly_repeats_the_tilesets_of_its_units() {
     let [one, two, three] = OPERATORS;
     let text = with_rules(&[("A", &[one]), ("A, B", &[two, three])]);
     let pairs = [("assembly", "1"), ("resolution", "1"), ("instances", "true")];
-    let options = params::parse(pairs).unwrap().options;
-    check(&options).unwrap();
+    let options = tileset_options(&pairs);
     let read =
         |control: &Control<'_>| structure::read_with(text.as_bytes(), &ReadLimits::default(), control).map(Box::new);
     let clock = StageClock::new(&());

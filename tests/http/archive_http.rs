@@ -349,7 +349,7 @@ async fn bodies_are_limited_during_the_transfer() {
     ] {
         let remote = Remote::saying(response);
         match once(&remote.url(CIF), |c| c.archive.max_bytes = 1000).await {
-            Err(FetchError::TooLarge { limit: 1000, .. }) => {}
+            Err(FetchError::TooLarge(error)) => assert_eq!(error.max, 1000),
             other => panic!("{other:?}"),
         }
         assert_eq!(remote.count(), 1, "not retried");

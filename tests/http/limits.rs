@@ -213,7 +213,9 @@ fn compression_bombs_stop_at_the_inflated_limit() {
     let archive = server.dir.path().join("archive");
     std::fs::create_dir_all(&archive).unwrap();
     std::fs::write(archive.join("1abc.cif"), vec![b' '; 1_000_001]).unwrap();
-    assert_eq!(server.get("/v1/pdb/1abc/surface.glb").problem(413, "inflated-too-large")["limit"], 1_000_000);
+    let problem = server.get("/v1/pdb/1abc/surface.glb").problem(413, "inflated-too-large");
+    let detail = "entry 1abc has 1000001 bytes, the limit is 1000000 (limits.inflated_bytes)";
+    assert_eq!((&problem["limit"], &problem["detail"]), (&1_000_000.into(), &detail.into()));
 }
 
 #[test]
@@ -587,6 +589,7 @@ fn memory_is_shared_and_limited() {
     let refused = server.post("/v1/meshes", &encoding, &body);
     let problem = refused.problem(422, "too-much-memory");
     assert_eq!((&problem["limit"], refused.header("retry-after")), (&limit.into(), None));
+    assert!(problem["detail"].as_str().unwrap().contains("(limits.memory_bytes)"), "{problem}");
     let small = || server.post("/v1/meshes?resolution=4", &[], SAMPLE).status == 200;
     wait_for("a small mesh is accepted", small);
     assert!(rejected(&server, "too-much-memory") >= 1.0);
@@ -766,6 +769,7 @@ fn buffers_of_connections_count_as_memory() {
     wait_for("the budget is used up", || server.post("/v1/meshes", &[], SAMPLE).status == 503);
     let problem = server.post("/v1/meshes", &[], SAMPLE).problem(503, "memory-full");
     assert!(problem["actual"].as_u64().unwrap() >= 10 * CONNECTION_BYTES, "{problem}");
+    assert!(problem["detail"].as_str().unwrap().contains("(limits.memory_bytes)"), "{problem}");
     assert_eq!(server.get("/livez").status, 200);
     drop(idle);
     wait_for("the buffers are freed", || server.post("/v1/meshes", &[], SAMPLE).status == 200);

@@ -190,7 +190,9 @@ fn a_result_that_exceeds_the_store_is_not_found_later() {
     assert_eq!(made.header("content-location"), None, "a result that is not kept has no address");
     // Work that requires the store is rejected.
     let refused = server.post("/v1/meshes", &[("prefer", "respond-async")], &sample(1));
-    assert_eq!(refused.problem(413, "body-too-large")["limit"], 3_000);
+    let problem = refused.problem(413, "body-too-large");
+    assert_eq!(problem["limit"], 3_000);
+    assert!(problem["detail"].as_str().unwrap().contains("(store.max_bytes)"), "{problem}");
     server.post("/v1/structures", &[], SAMPLE).problem(413, "body-too-large");
 }
 

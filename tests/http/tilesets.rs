@@ -363,7 +363,7 @@ fn a_tileset_larger_than_the_cache_is_on_disk() {
         assert!(problem["detail"].as_str().unwrap().contains(parameter), "{problem}");
     }
     drop((on_disk, narrow));
-    for (scratch, place) in [(1_000_000, "disk space"), (0, "limits.structure_cache_bytes")] {
+    for (scratch, place) in [(1_000_000, "limits.scratch_bytes"), (0, "limits.structure_cache_bytes")] {
         let server = started(CACHE, scratch);
         let path = format!("{}/tileset.json?select=all&resolution=4", upload(&server, &text));
         let problem = server.get(&path).problem(422, "too-much-memory");

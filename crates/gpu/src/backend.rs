@@ -3,8 +3,8 @@
 use std::sync::Arc;
 
 use molmesh_surface::{
-    Backend, BackendIdentity, Control, DeviceStatus, MeshOutput, MeshSink, Reservation, Spheres, Stage, SurfaceError,
-    SurfaceLimits, SurfaceParams, backend::one_atom,
+    Backend, BackendIdentity, Control, DeviceStatus, MeshOutput, MeshSink, Spheres, Stage, SurfaceError, SurfaceLimits,
+    SurfaceParams, backend::one_atom,
 };
 
 use super::device_queue::single_line;
@@ -123,9 +123,8 @@ impl Backend for GpuBackend {
         sink: Option<&dyn MeshSink>,
     ) -> Result<MeshOutput, SurfaceError> {
         control.check()?;
-        let memory = Arc::new(Reservation::new(&control.memory));
-        let of_job = Control { memory: Arc::<Reservation>::clone(&memory), ..control.clone() };
-        let job = Self::job(spheres, params, limits, &of_job)?;
+        let (metered, memory) = control.with_reservation();
+        let job = Self::job(spheres, params, limits, &metered)?;
         let completed = self.pool.run(&job).and_then(|mut completed| {
             control.span(Stage::Measure, || completed.finished.measure(&job.prepared))?;
             Ok(completed)

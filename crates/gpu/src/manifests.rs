@@ -50,7 +50,7 @@ fn under(root: &Path, variable: impl Fn(&str) -> Option<String>) -> Vec<Manifest
     let set = |name: &str| variable(name).filter(|value| !value.is_empty());
     let listed = |value: String| value.split(':').map(|path| inside(root, path)).collect::<Vec<_>>();
     let replacing = REPLACING.into_iter().find_map(set);
-    let of_the_system = || {
+    let system_paths = || {
         let mut paths = set(ADDITIONAL).map(listed).unwrap_or_default();
         let home = set("HOME").unwrap_or_default();
         for (name, default) in FOLDERS {
@@ -62,7 +62,7 @@ fn under(root: &Path, variable: impl Fn(&str) -> Option<String>) -> Vec<Manifest
         }
         paths
     };
-    let paths = replacing.map_or_else(of_the_system, listed);
+    let paths = replacing.map_or_else(system_paths, listed);
     let mut found: Vec<Manifest> = Vec::new();
     for path in paths.iter().flat_map(|path| files(path)) {
         if !found.iter().any(|other| other.path == path) {

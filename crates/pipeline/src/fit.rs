@@ -192,8 +192,8 @@ pub(super) fn mesh(
         let params = options.mesh_params(meshing.spheres, Some(spacing));
         let without_progress = WithoutProgress(*clock);
         let observer: &dyn Observer = if search.tries() == 0 { &without_progress } else { *clock };
-        let memory = Arc::new(Reservation::new(&control.memory));
-        let control = Control { observer, memory: Arc::<Reservation>::clone(&memory), ..control.clone() };
+        let (metered, memory) = control.with_reservation();
+        let control = Control { observer, ..metered };
         let output = unless_empty(clock.pass(|| meshing.mesh(&params, &control)))?;
         let by = output.as_ref().and_then(|output| output.made_by.as_ref()).map(|identity| identity.backend);
         if by.is_some() && made_by.is_some() && by != made_by {

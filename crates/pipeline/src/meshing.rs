@@ -1,13 +1,10 @@
 //! Mesh of spheres: chooses how a backend meshes them, improves the triangles, and divides the mesh into parts with
 //! meshes of their own, or by the atoms nearest to its triangles.
 
-use std::sync::Arc;
-
 use molmesh_structure::AtomPart;
 use molmesh_surface::improve::improve;
 use molmesh_surface::{
-    Backend, Control, MeshOutput, Reservation, Spheres, Stage, SurfaceError, SurfaceLimits, SurfaceParams,
-    TriangleQuality,
+    Backend, Control, MeshOutput, Spheres, Stage, SurfaceError, SurfaceLimits, SurfaceParams, TriangleQuality,
 };
 
 use super::cut::Cut;
@@ -69,8 +66,7 @@ impl Meshing<'_> {
         };
         // The content key names one backend. If it fails after some parts, the fallback meshes all parts again.
         for _attempt in 0..2 {
-            let memory = Arc::new(Reservation::new(&control.memory));
-            let metered = Control { memory: Arc::<Reservation>::clone(&memory), ..control.clone() };
+            let (metered, memory) = control.with_reservation();
             if let Some(output) = parts::join(parts, mesh, &run, &metered)? {
                 memory.keep();
                 return Ok(output);

@@ -118,6 +118,19 @@ pub fn parse_with<N: AsRef<str>, V: AsRef<str>, E: From<ParamError>>(
     Ok(Request { options: values.options, format, strict: values.strict })
 }
 
+/// Parses parameters of a tileset, whose tiles are GLB files, compressed by default. Adds this default to the pairs.
+///
+/// # Errors
+/// Returns the errors of [`parse`], and [`ParamError::BadValue`] for a parameter that does not apply to tiles.
+pub fn parse_tileset(pairs: &mut Vec<(String, String)>) -> Result<Request, ParamError> {
+    if pairs.iter().all(|(name, _)| name != "compress") {
+        pairs.push(("compress".to_owned(), Compress::Meshopt.name().to_owned()));
+    }
+    let request = parse_with(pairs.iter().map(|(name, value)| (name, value)), |_| Ok::<_, ParamError>(Format::Glb))?;
+    tileset::check(&request.options)?;
+    Ok(request)
+}
+
 /// Parses parameters and checks them, apart from the format.
 fn parse_values<N: AsRef<str>, V: AsRef<str>>(
     pairs: impl IntoIterator<Item = (N, V)>,

@@ -25,7 +25,7 @@ pub struct TriangleReport {
 
 impl TriangleReport {
     /// Returns the report of a mesh if the job improves triangles.
-    pub(super) fn of_job(options: &Options, mesh: &Mesh, clock: &StageClock<'_>) -> Option<Self> {
+    pub(super) fn for_job(options: &Options, mesh: &Mesh, clock: &StageClock<'_>) -> Option<Self> {
         let is_improved = options.quality == TriangleQuality::High;
         is_improved.then(|| clock.time(Stage::Measure.name(), || Self::new(mesh)))
     }

@@ -53,7 +53,7 @@ impl Steps<'_> {
             Some(measures) if cut.is_some() || measures.validation == options.validation => measures,
             found => clock.time(Stage::Measure.name(), || measures_of(mesh, found, options.validation, control))?,
         };
-        let shapes = TriangleReport::of_job(options, mesh, clock);
+        let shapes = TriangleReport::for_job(options, mesh, clock);
         Ok(StepResults { cavities, simplification, color, measures, shapes })
     }
 }

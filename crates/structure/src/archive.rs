@@ -11,6 +11,7 @@ use std::path::{Path, PathBuf};
 use std::str::FromStr;
 use std::time::SystemTime;
 
+use molmesh_surface::{Exceeded, Limit};
 use thiserror::Error;
 
 /// Errors of fetching an entry.
@@ -25,15 +26,8 @@ pub enum ArchiveError {
         id: String,
     },
     /// The file is larger than allowed.
-    #[error("entry {id} has {bytes} bytes, the limit is {limit}")]
-    TooLarge {
-        /// The entry.
-        id: EntryId,
-        /// Bytes of the file.
-        bytes: u64,
-        /// Bytes allowed.
-        limit: u64,
-    },
+    #[error(transparent)]
+    Limit(#[from] Box<Exceeded>),
     /// The folder or the file cannot be read.
     #[error("the archive cannot be read")]
     Io(#[from] io::Error),
@@ -113,7 +107,7 @@ impl Archive {
     /// does not exist. Blocks.
     ///
     /// # Errors
-    /// [`ArchiveError::TooLarge`] and [`ArchiveError::Io`].
+    /// [`ArchiveError::Limit`] and [`ArchiveError::Io`].
     pub fn fetch(&self, id: &EntryId) -> Result<Option<(Vec<u8>, Stamp)>, ArchiveError> {
         let Some(mut opened) = self.open(id)? else { return Ok(None) };
         let bytes = opened.read_all()?;
@@ -131,11 +125,14 @@ impl Archive {
     /// Opens the file of an entry, or returns `None` if it does not exist. Blocks.
     ///
     /// # Errors
-    /// [`ArchiveError::TooLarge`] and [`ArchiveError::Io`].
+    /// [`ArchiveError::Limit`] and [`ArchiveError::Io`].
     pub fn open(&self, id: &EntryId) -> Result<Option<Opened>, ArchiveError> {
         let (found, limit) = (self.find(id)?, self.max_bytes);
         match found.as_ref().map(|opened| opened.stamp.bytes).filter(|bytes| *bytes > limit) {
-            Some(bytes) => Err(ArchiveError::TooLarge { id: id.clone(), bytes, limit }),
+            Some(bytes) => {
+                let (subject, actual) = (format!("entry {id}").into(), Some(bytes));
+                Err(Exceeded { subject, actual, ..Exceeded::new(Limit::InflatedBytes, limit) }.error())
+            }
             None => Ok(found),
         }
     }

@@ -52,7 +52,7 @@ pub enum StructureError {
     /// The disk of the temporary file is full.
     #[error("the disk of the temporary file is full")]
     DiskFull,
-    /// Temporary files would exceed their limit.
+    /// Temporary files use up their limit.
     #[error("{}", disk_space(.0))]
     DiskSpace(OutOfMemory),
     /// The file cannot be read as a stream.
@@ -123,17 +123,8 @@ pub enum StructureError {
     },
 }
 
-/// Describes that the limit of temporary files is reached.
+/// Describes that temporary files use up their limit.
 fn disk_space(error: &OutOfMemory) -> String {
-    match error {
-        OutOfMemory::Limit { needed, limit } => {
-            format!("the index of the atoms needs at least {needed} bytes of disk space and the limit is {limit}")
-        }
-        OutOfMemory::Budget { held, limit, .. } => {
-            format!(
-                "temporary files take {held} of {limit} bytes of disk space, and indexes of other tilesets are in use"
-            )
-        }
-        OutOfMemory::Share { .. } | OutOfMemory::System { .. } => error.to_string(),
-    }
+    let OutOfMemory::Budget { held, limit, .. } = error else { return error.to_string() };
+    format!("temporary files take {held} of {limit} bytes of disk space, and indexes of other tilesets are in use")
 }

@@ -4,7 +4,7 @@ use std::fs::File;
 use std::io::{ErrorKind, Read as _, Seek as _, SeekFrom, Write as _};
 use std::sync::{Arc, Mutex, PoisonError};
 
-use molmesh_surface::{MemoryMeter, Reservation};
+use molmesh_surface::{Exceeded, Limit, MemoryMeter, OutOfMemory, Reservation};
 
 use super::error::StructureError;
 
@@ -43,9 +43,15 @@ impl StoredBytes {
     /// Writes bytes at a reserved offset, once, and adds them to the meter.
     ///
     /// # Errors
-    /// Returns [`StructureError::Scratch`], [`StructureError::DiskFull`] and [`StructureError::DiskSpace`].
+    /// Returns [`StructureError::Scratch`], [`StructureError::DiskFull`], [`StructureError::DiskSpace`] and
+    /// [`StructureError::Limit`].
     pub fn write(&self, offset: u64, bytes: &[u8]) -> Result<(), StructureError> {
-        self.bytes.grow(bytes.len() as u64).map_err(StructureError::DiskSpace)?;
+        self.bytes.grow(bytes.len() as u64).map_err(|error| match error {
+            OutOfMemory::Limit { needed, limit } => {
+                Exceeded { actual: Some(needed), ..Exceeded::new(Limit::ScratchBytes, limit) }.error()
+            }
+            error => StructureError::DiskSpace(error),
+        })?;
         self.at(offset, |file| file.write_all(bytes))
     }
 

@@ -215,11 +215,9 @@ impl<'a> Blocks<'a> {
                 continue;
             }
             let is_whole = is_last && self.lines == 0;
-            let memory = Arc::new(Reservation::new(&control.memory));
-            let of_attempt = Control { memory: Arc::<Reservation>::clone(&memory), ..control.clone() };
-            let (limits, of_attempt) = (&self.limits, &of_attempt);
-            let reading =
-                if is_whole { Reading::new(limits, of_attempt) } else { Reading::of_block(limits, of_attempt) };
+            let (metered, memory) = control.with_reservation();
+            let begin = if is_whole { Reading::new } else { Reading::of_block };
+            let reading = begin(&self.limits, &metered);
             let structure = mmcif::read(without_mark(&self.text[..end]), &reading)
                 .map_err(|error| if is_last { self.moved(error, head) } else { self.of_block(error, head, end) })?;
             if structure.len() != n_rows && !is_whole {

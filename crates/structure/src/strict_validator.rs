@@ -157,8 +157,8 @@ pub fn check(bytes: &[u8], limits: &ReadLimits, control: &Control<'_>) -> Result
         SourceFormat::Xyz => return unread("XYZ"),
     };
     let memory = control.reserve(MEMORY_PER_BYTE * text.len() as u64)?;
-    let of_structure = control.metered();
-    let cost = match read::read_with(text, limits, &of_structure) {
+    let metered = control.metered();
+    let cost = match read::read_with(text, limits, &metered) {
         Ok(structure) => Cost::of(&structure, text),
         Err(StructureError::Syntax { .. } | StructureError::NoAtoms { .. }) => {
             if text.len() as u64 > MAX_UNREAD_BYTES {
@@ -170,7 +170,7 @@ pub fn check(bytes: &[u8], limits: &ReadLimits, control: &Control<'_>) -> Result
         }
         Err(error) => return Err(error),
     };
-    drop(of_structure);
+    drop(metered);
     // The estimated cost applies to a file with one `atom_site` category.
     if !cost.is_low() || count(text, b"_atom_site.label_asym_id") > 1 {
         let message = "not checked: the strict validator would take too long, because its time grows with the square \

@@ -68,7 +68,7 @@ pub(super) fn read(text: &[u8], reading: &Reading<'_>) -> Result<Structure, Stru
         let count = number_of_atoms(&fields).map_err(|fault| fault.locate(text))?;
         let rows = rows.get_or_insert_with(|| Rows::new(reading, count.min(text.len() / MIN_LINE) + 1));
         let comment = lines.next().ok_or_else(|| ends(text, "a comment line".to_owned()))?;
-        let of_frame = atom_fields(text, comment.start, comment.end).map_err(|fault| fault.locate(text))?;
+        let frame_fields = atom_fields(text, comment.start, comment.end).map_err(|fault| fault.locate(text))?;
         if model == 0 {
             title = normalize(&text[comment], MAX_TITLE);
         }
@@ -77,7 +77,7 @@ pub(super) fn read(text: &[u8], reading: &Reading<'_>) -> Result<Structure, Stru
             let line = lines.next().ok_or_else(|| ends(text, format!("atom {row} of {count}")))?;
             rows.count_line()?;
             let fields = Fields::split(text, line);
-            atom(text, &fields, of_frame, rows, model)?;
+            atom(text, &fields, frame_fields, rows, model)?;
         }
     }
     let Some(rows) = rows else {
@@ -90,11 +90,11 @@ pub(super) fn read(text: &[u8], reading: &Reading<'_>) -> Result<Structure, Stru
 fn atom(
     text: &[u8],
     fields: &Fields<'_>,
-    of_frame: AtomFields,
+    frame_fields: AtomFields,
     rows: &mut Rows<'_>,
     model: i32,
 ) -> Result<(), StructureError> {
-    let AtomFields { element, position } = of_frame;
+    let AtomFields { element, position } = frame_fields;
     if fields.len() == 0 {
         return Err(fields.fault(0, "an element and three coordinates").locate(text));
     }

@@ -152,10 +152,23 @@ impl Control<'_> {
         Ok(reservation)
     }
 
+    /// Returns a control with another meter.
+    #[must_use]
+    pub fn with_memory<M: MemoryMeter + 'static>(&self, memory: &Arc<M>) -> Self {
+        Self { memory: Arc::<M>::clone(memory), ..self.clone() }
+    }
+
     /// Returns a control that releases its memory when its last clone is dropped.
     #[must_use]
     pub fn metered(&self) -> Self {
-        Self { memory: Arc::new(Reservation::new(&self.memory)), ..self.clone() }
+        self.with_reservation().0
+    }
+
+    /// Returns a control as [`Self::metered`] does, with its reservation, which may keep the memory.
+    #[must_use]
+    pub fn with_reservation(&self) -> (Self, Arc<Reservation>) {
+        let memory = Arc::new(Reservation::new(&self.memory));
+        (self.with_memory(&memory), memory)
     }
 
     /// Times `work` as a part of `stage` and returns its value.

@@ -41,6 +41,12 @@ pub enum Limit {
     FileVertices,
     FileTriangles,
     AtomIndex,
+    EntryBytes,
+    StoreBytes,
+    ResultBytes,
+    JobRecords,
+    MemoryBytes,
+    ScratchBytes,
 }
 
 /// Row of the table of limits.
@@ -78,6 +84,7 @@ const NONE: LimitRow = LimitRow {
 
 const PAIRS_KEY: Option<&str> = Some("limits.candidate_pairs");
 const PAIRS_FLAG: Option<&str> = Some("--max-candidates");
+const STORE_KEY: Option<&str> = Some("store.max_bytes");
 
 /// All limits, in the order of [`Limit`].
 #[rustfmt::skip]
@@ -148,6 +155,19 @@ pub const LIMITS: &[LimitRow] = &[
         problem: "mesh-too-large", ..NONE },
     LimitRow { limit: Limit::AtomIndex, subject: "an atom index in the file", predicate: "is {}",
         parameter: Some("atom_ids"), hint: Some("the format ply"), problem: "mesh-too-large", ..NONE },
+    LimitRow { limit: Limit::EntryBytes, subject: "the file of the archive", predicate: "has {} bytes",
+        problem: "entry-too-large", ..NONE },
+    LimitRow { limit: Limit::StoreBytes, subject: "the file", predicate: "needs {} bytes in the store",
+        key: STORE_KEY, problem: "body-too-large", ..NONE },
+    LimitRow { limit: Limit::ResultBytes, subject: "the file", predicate: "would need {} bytes in the store",
+        key: STORE_KEY, problem: "mesh-too-large", ..NONE },
+    LimitRow { limit: Limit::JobRecords, subject: "the client", predicate: "would have {} open jobs on record",
+        key: Some("jobs.records_per_client"), problem: "too-many-jobs", ..NONE },
+    LimitRow { limit: Limit::MemoryBytes, subject: "the request", predicate: "needs at least {} bytes of memory at once",
+        key: Some("limits.memory_bytes"), problem: "too-much-memory", ..NONE },
+    LimitRow { limit: Limit::ScratchBytes, subject: "the index of the atoms",
+        predicate: "needs at least {} bytes of disk space", key: Some("limits.scratch_bytes"),
+        problem: "too-much-memory", ..NONE },
 ];
 
 impl Limit {

@@ -133,8 +133,8 @@ fn find_at(
     limits: &SurfaceLimits,
     control: &Control<'_>,
 ) -> Result<Pockets, SurfaceError> {
-    let memory = Arc::new(Reservation::new(&control.memory));
-    let control = &Control { memory: Arc::<Reservation>::clone(&memory), observer: &(), ..control.clone() };
+    let (metered, memory) = control.with_reservation();
+    let control = &Control { observer: &(), ..metered };
     let params = params_at(spacing, params);
     let [small, large] = [params.probe, pocket_probe].map(|probe| probe / spacing);
     let grid = Grid::around(spheres, &params, pocket_probe, limits, control)?;

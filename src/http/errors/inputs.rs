@@ -2,12 +2,14 @@
 
 use std::time::Duration;
 
+use super::with_key;
 use crate::http::problem::Problem;
 use crate::http::problem_types::ProblemType;
 use crate::jobs::Failure;
 use crate::pipeline::color::{self, ColorError};
 use crate::structure::map::MapError;
 use crate::structure::{Split, StructureError};
+use crate::surface::Limit;
 
 impl From<StructureError> for Problem {
     fn from(error: StructureError) -> Self {
@@ -16,7 +18,7 @@ impl From<StructureError> for Problem {
         match error {
             E::Scratch { .. } => Self::internal(detail),
             E::DiskFull => Self::new(ProblemType::StoreFull, detail).retry_after(Duration::from_secs(5)),
-            E::DiskSpace(error) => Self::from(error).detailed(detail),
+            E::DiskSpace(error) => Self::from(error).detailed(with_key(&detail, Limit::ScratchBytes)),
             E::Input { .. } | E::NotAStream { .. } => Self::new(ProblemType::UnreadableStructure, detail),
             E::UnknownFormat { found } => Self::new(ProblemType::UnreadableStructure, detail).with("found", found),
             E::Syntax { line, column, found, expected } => Self::new(ProblemType::UnreadableStructure, detail)

@@ -23,9 +23,9 @@ type RunCounts = std::sync::Mutex<BTreeMap<JobId, (u32, u32)>>;
 /// Changes the counts of a job and returns them. Assertions follow outside the lock: a poisoned one would hide them.
 fn change(counts: &RunCounts, id: &JobId, change: impl FnOnce(&mut (u32, u32))) -> (u32, u32) {
     let mut counts = counts.lock().unwrap();
-    let of_job = counts.entry(id.clone()).or_default();
-    change(of_job);
-    *of_job
+    let count = counts.entry(id.clone()).or_default();
+    change(count);
+    *count
 }
 
 /// Runs a claimed job, which ends or returns to the queue. `returns_early` returns it before its run has ended.

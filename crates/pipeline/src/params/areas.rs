@@ -51,9 +51,9 @@ pub fn parse(pairs: &[(String, String)]) -> Result<AreasRequest, ParamError> {
     if value_of(pairs, "model").is_some_and(|model| model.trim() == "all") {
         return Err(ParamError::bad_value("model", "all", "the number of one model"));
     }
-    let (own, of_mesh): (Vec<_>, Vec<_>) = pairs.iter().partition(|(name, _)| name == BY);
-    let of_mesh = of_mesh.iter().map(|(name, value)| (name.as_str(), value.as_str()));
-    let options = super::parse(of_mesh.chain([("exact", "true")]))?.options;
+    let (own, mesh_pairs): (Vec<_>, Vec<_>) = pairs.iter().partition(|(name, _)| name == BY);
+    let mesh_pairs = mesh_pairs.iter().map(|(name, value)| (name.as_str(), value.as_str()));
+    let options = super::parse(mesh_pairs.chain([("exact", "true")]))?.options;
     let level = match &own[..] {
         [] => AreaLevel::default(),
         [(_, value)] => {

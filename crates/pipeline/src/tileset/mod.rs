@@ -83,7 +83,7 @@ pub const NOT_APPLICABLE: [&str; 17] = [
 ///
 /// # Errors
 /// Returns [`ParamError::BadValue`].
-pub fn check(options: &Options) -> Result<(), ParamError> {
+pub(super) fn check(options: &Options) -> Result<(), ParamError> {
     let selection = &options.selection;
     let when = |is_refused: bool, value: &str| is_refused.then(|| value.to_owned());
     let of_vertices = |color: &Coloring| matches!(color.scheme, Scheme::Vertex(_));

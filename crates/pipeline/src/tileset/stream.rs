@@ -132,9 +132,9 @@ impl BlockReader<'_> {
         let mut blocks = clock.time("read", open)?;
         loop {
             // Releases the memory of the block.
-            let of_block = control.metered();
-            let Some(mut block) = clock.time("read", || blocks.next(&of_block))? else { break };
-            clock.time("select", || self.add(&mut block, &of_block))?;
+            let block_control = control.metered();
+            let Some(mut block) = clock.time("read", || blocks.next(&block_control))? else { break };
+            clock.time("select", || self.add(&mut block, &block_control))?;
         }
         self.assemblies = blocks.take_assemblies();
         self.memory = Reservation::new(&control.memory);
@@ -213,8 +213,8 @@ impl Tileset<Box<Structure>> {
             StreamSource::Structure(structure) => {
                 let mut block = Block { len: structure.len(), structure: structure.clone() };
                 reader.assemblies = std::mem::take(&mut block.structure.assemblies);
-                let of_block = control.metered();
-                clock.time("select", || reader.add(&mut block, &of_block))?;
+                let block_control = control.metered();
+                clock.time("select", || reader.add(&mut block, &block_control))?;
             }
         }
         let BlockReader { selected, colors, spheres, head, assemblies, memory: _memory, .. } = reader;

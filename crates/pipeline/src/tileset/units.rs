@@ -173,13 +173,13 @@ impl<S: Deref<Target = Structure>> AssemblyTileset<S> {
         }
         for unit in &self.selected.units {
             // Releases the memory of the index of the unit.
-            let of_unit = &control.metered();
+            let unit_control = &control.metered();
             let rows = rows_of(unit);
-            of_unit.memory.grow((SPHERE_BYTES + 4) * rows.len() as u64)?;
+            unit_control.memory.grow((SPHERE_BYTES + 4) * rows.len() as u64)?;
             let own = Arc::new(self.spheres.subset(&rows));
-            let buckets = Arc::new(Buckets::new(&own, side, of_unit)?);
+            let buckets = Arc::new(Buckets::new(&own, side, unit_control)?);
             let params = options.params_for(own.len());
-            let level = TilesetLevel::new(&own, &buckets, &params, [spacing, CELLS * spacing], of_unit)?;
+            let level = TilesetLevel::new(&own, &buckets, &params, [spacing, CELLS * spacing], unit_control)?;
             control.memory.grow((SPHERE_BYTES + 4) * level.spheres.len() as u64)?;
             let first = atoms.len();
             for (number, sphere) in (0..level.spheres.len()).zip(0_u32..) {

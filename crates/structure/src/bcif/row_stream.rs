@@ -1,7 +1,5 @@
 //! Rows of a BinaryCIF file in blocks, so that the memory depends on a block and on the texts of the file.
 
-use std::sync::Arc;
-
 use molmesh_surface::{Control, MemoryMeter as _, Reservation};
 
 use super::super::assembly::Assemblies;
@@ -125,9 +123,8 @@ impl RowStream {
             if n == 0 {
                 return self.findings.check("the categories `entity` and `struct_asym`").map(|()| None);
             }
-            let memory = Arc::new(Reservation::new(&control.memory));
-            let of_attempt = Control { memory: Arc::<Reservation>::clone(&memory), ..control.clone() };
-            let reading = Reading::of_block(limits, &of_attempt);
+            let (metered, memory) = control.with_reservation();
+            let reading = Reading::of_block(limits, &metered);
             let structure = self.structure(&reading)?;
             let is_last = self.table.first + n == self.n_rows;
             let Some(len) = (if is_last { Some(n) } else { divisions::last_division(&structure) }) else {

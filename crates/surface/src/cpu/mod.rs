@@ -31,7 +31,6 @@ mod table;
 mod write;
 
 use std::ops::Range;
-use std::sync::Arc;
 
 use self::bin::{Tiles, slot_brick};
 use self::classify::{ClassifiedBricks, CountsBefore};
@@ -46,7 +45,6 @@ use super::control::{Control, Stage};
 use super::error::SurfaceError;
 use super::kernel::Shape;
 use super::lattice::{Lattice, TILE, to_f32, to_u32};
-use super::memory::Reservation;
 use super::params::{SurfaceLimits, SurfaceParams};
 use super::quantize::Step;
 use super::sink::MeshSink;
@@ -116,9 +114,7 @@ impl Backend for CpuBackend {
     ) -> Result<MeshOutput, SurfaceError> {
         self.install(|free_threads| {
             // Only the mesh outlives the run.
-            let memory = Arc::new(Reservation::new(&control.memory));
-            let of_scan = Control { memory: Arc::<Reservation>::clone(&memory), ..control.clone() };
-            let context = RunContext { params, limits, control: &of_scan, free_threads };
+            let context = RunContext { params, limits, control: &control.metered(), free_threads };
             write::write(scan(spheres, context)?, context, control, sink)
         })
     }
