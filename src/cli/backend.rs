@@ -1,7 +1,6 @@
 //! Selection of the backend, with the reason.
 
 use std::num::NonZero;
-#[cfg(feature = "gpu")]
 use std::sync::Arc;
 
 use molmesh::config::DevicesConfig;
@@ -12,6 +11,7 @@ use molmesh::picture::CpuRenderer;
 use molmesh::picture::SelectedRenderer;
 #[cfg(feature = "gpu")]
 use molmesh::pipeline::AutoBackend;
+use molmesh::pipeline::SelectedBackend;
 use molmesh::surface::cpu::CpuBackend;
 use molmesh::surface::reference::ReferenceBackend;
 use molmesh::surface::{Backend, DeviceChoice, FoundDevice};
@@ -19,8 +19,6 @@ use molmesh::surface::{Backend, DeviceChoice, FoundDevice};
 use super::args::{BackendName, JobArgs};
 use super::error::CliError;
 
-/// Maximum number of threads of the CPU backend: more than any machine has cores.
-const MAX_THREADS: usize = 1024;
 /// Work of a command up to which `--backend auto` takes the CPU, in the units of
 /// [`estimate_work`](molmesh::pipeline::estimate_work): 4 s on two cores. A GPU takes up to a second to start.
 const MAX_CPU_WORK: f64 = 1e6;
@@ -74,35 +72,11 @@ impl<'a> BackendRequest<'a> {
     }
 }
 
-/// Selected backend with the reason.
-pub(crate) struct SelectedBackend {
-    pub(crate) backend: Box<dyn Backend>,
-    /// Reason of the selection.
-    pub(crate) reason: String,
-    /// Renderer of pictures with its reason; the CPU if no pictures are needed.
-    pub(crate) renderer: SelectedRenderer,
-    /// All discovered devices, used or not.
-    pub(crate) devices: Vec<FoundDevice>,
-    /// Reason for not using a GPU, if none is used.
-    pub(crate) no_gpu: Option<String>,
-}
-
-/// Checks the value of `--threads`.
-///
-/// # Errors
-/// Returns [`CliError::Usage`].
-pub(crate) fn check_threads(threads: Option<usize>) -> Result<(), CliError> {
-    let Some(n) = threads.filter(|n| !(1..=MAX_THREADS).contains(n)) else { return Ok(()) };
-    let message = format!("parameter `threads`: {n} is not allowed; expected a number from 1 to {MAX_THREADS}");
-    Err(CliError::usage(message))
-}
-
 /// Rejects flags that contradict each other.
 ///
 /// # Errors
 /// Returns [`CliError::Usage`] if they do.
 pub(crate) fn check(requested: &BackendRequest<'_>) -> Result<(), CliError> {
-    check_threads(requested.threads)?;
     if requested.backend == BackendName::Gpu && *requested.devices == DeviceChoice::Cpu {
         return Err(CliError::usage("parameter `devices`: cpu is not allowed with --backend gpu; expected a GPU"));
     }
@@ -116,9 +90,9 @@ pub(crate) fn check(requested: &BackendRequest<'_>) -> Result<(), CliError> {
 /// requested backend is not available.
 pub(crate) fn select(requested: &BackendRequest<'_>) -> Result<SelectedBackend, CliError> {
     check(requested)?;
-    let backend: Box<dyn Backend> = match requested.backend {
+    let backend: Arc<dyn Backend> = match requested.backend {
         BackendName::Cpu => cpu(requested)?,
-        BackendName::Reference => Box::new(ReferenceBackend),
+        BackendName::Reference => Arc::new(ReferenceBackend),
         BackendName::Auto | BackendName::Gpu => return gpu_or_cpu(requested),
     };
     Ok(SelectedBackend {
@@ -169,11 +143,11 @@ fn instead_of_gpu(requested: &BackendRequest<'_>, reason: String, none: NoGpu) -
     Ok(SelectedBackend { backend: cpu(requested)?, reason, renderer, devices: none.devices, no_gpu: Some(none.why) })
 }
 
-fn cpu(requested: &BackendRequest<'_>) -> Result<Box<dyn Backend>, CliError> {
+fn cpu(requested: &BackendRequest<'_>) -> Result<Arc<dyn Backend>, CliError> {
     let all = || std::thread::available_parallelism().map_or(1, NonZero::get);
     let threads = requested.threads.or_else(|| requested.is_command().then(all));
     let backend = CpuBackend::new(threads).map_err(|why| CliError::NoBackend { requested: "cpu", why })?;
-    Ok(Box::new(backend))
+    Ok(Arc::new(backend))
 }
 
 /// Reason why no GPU is used, with the discovered devices.
@@ -242,9 +216,9 @@ fn gpu(requested: &BackendRequest<'_>) -> Result<SelectedBackend, NoGpu> {
     };
     // A request for the GPU has no fallback.
     let cpu = if auto { CpuBackend::new(requested.threads).ok() } else { None };
-    let backend: Box<dyn Backend> = match cpu {
-        Some(cpu) => Box::new(AutoBackend::new(Box::new(cpu), Box::new(backend))),
-        None => Box::new(backend),
+    let backend: Arc<dyn Backend> = match cpu {
+        Some(cpu) => Arc::new(AutoBackend::new(Box::new(cpu), Box::new(backend))),
+        None => Arc::new(backend),
     };
     Ok(SelectedBackend { backend, reason, renderer, devices, no_gpu: None })
 }

@@ -1,4 +1,4 @@
-//! Job of the commands `mesh` and `render`: reads one structure, and writes one file and one report.
+//! Job of the commands `mesh`, `render` and `tileset`: reads one structure, and writes its files and one report.
 
 use std::cell::{Cell, OnceCell};
 use std::fs::File;
@@ -10,20 +10,23 @@ use std::time::{Duration, Instant};
 use molmesh::formats::{Format, GlbSink};
 use molmesh::pipeline::params::Request;
 use molmesh::pipeline::tileset::{self, StreamSource, StructureStream, TilesetReport, WriteError};
-use molmesh::pipeline::{self, Choice, JobError, JobLimits, MapFile, Options, Product, Report};
+use molmesh::pipeline::{self, JobError, JobLimits, MapFile, Options, Product, Report, SelectedBackend};
 use molmesh::structure::stream::{BLOCK_BYTES, ScratchFile};
 use molmesh::structure::strict_validator::{self, Diagnostic, Level};
 use molmesh::structure::{self, Structure, StructureError, table};
 use molmesh::surface::{CancelToken, Control, Exceeded, Limit, SurfaceError};
 
 use super::args::JobArgs;
-use super::backend::{self, BackendRequest, Purpose, SelectedBackend};
+use super::backend::{self, BackendRequest, Purpose};
 use super::error::CliError;
 use super::output::{self, Output, is_stdio};
 use super::progress::Progress;
 use super::report::{CommandReport, finding};
 use super::style::Style;
 use super::{interrupt, request, summary};
+
+/// Maximum value of `--threads`: more than any machine has cores.
+const MAX_THREADS: usize = 1024;
 
 /// Job of a command, with its input and backend.
 pub(super) struct CommandJob<'a> {
@@ -47,7 +50,8 @@ impl<'a> CommandJob<'a> {
     /// Prepares a job and opens its output.
     pub(super) fn prepare(
         request: Request,
-        (path, output): (&'a Path, &Path),
+        path: &'a Path,
+        output: &Path,
         args: &'a JobArgs,
     ) -> Result<(Self, Output), CliError> {
         let format = request.format;
@@ -61,37 +65,35 @@ impl<'a> CommandJob<'a> {
             output.refuse_terminal(format)?;
             Ok(output)
         };
-        Self::prepare_for(purpose, request, (path, None), args, open)
+        Self::prepare_for(purpose, request, path, None, args, open)
     }
 
-    /// Prepares a job whose output `open` opens. Cheap steps come first: flags, output, input, backend. The input is
-    /// read later if its estimated number of atoms is given.
+    /// Prepares a job whose output `open` opens. Cheap steps come first: flags, output, input, backend. An input that
+    /// is read later, as a stream, has an estimated number of atoms in `streamed_atoms`.
     pub(super) fn prepare_for<T>(
         purpose: Purpose,
         Request { mut options, strict, .. }: Request,
-        (path, streamed): (&'a Path, Option<f64>),
+        path: &'a Path,
+        streamed_atoms: Option<f64>,
         args: &'a JobArgs,
         open: impl FnOnce(&CancelToken) -> Result<T, CliError>,
     ) -> Result<(Self, T), CliError> {
-        let limits =
-            if streamed.is_some() { request::limits_of_stream(&args.limits) } else { request::limits(&args.limits) };
+        let is_streamed = streamed_atoms.is_some();
+        let limits = if is_streamed { request::limits_of_stream(&args.limits) } else { request::limits(&args.limits) };
         let mut requested = BackendRequest::for_command(args, purpose);
-        request::check(args, &requested, &options, path)?;
         set_threads(args.threads)?;
+        request::check(args, &requested, &options, path)?;
         let cancel = CancelToken::default();
         interrupt::watch(&cancel)?;
         let output = open(&cancel)?;
-        let input = if streamed.is_some() {
-            Vec::new()
-        } else {
-            read(path, Limit::InflatedBytes, limits.read.max_inflated_bytes)?
-        };
+        let input =
+            if is_streamed { Vec::new() } else { read(path, Limit::InflatedBytes, limits.read.max_inflated_bytes)? };
         if let Some(map) = args.map.as_deref() {
             // The command line makes no content keys.
             let bytes = read(map, Limit::MapBytes, limits.map.max_inflated_bytes)?;
             options.map = Some(MapFile::new(String::new(), bytes));
         }
-        let atoms = streamed.unwrap_or_else(|| pipeline::estimate_atoms(&input));
+        let atoms = streamed_atoms.unwrap_or_else(|| pipeline::estimate_atoms(&input));
         requested.work = Some(pipeline::estimate_work(atoms, &options));
         let selected = backend::select(&requested)?;
         let progress = Progress::new(!args.quiet);
@@ -117,7 +119,7 @@ impl<'a> CommandJob<'a> {
 
     /// Computes the mesh. If the job allows it, the mesh is written to `sink` as GLB at the same time.
     pub(super) fn run(&self, sink: Option<&GlbSink<'_>>) -> Result<Product, JobError> {
-        let choice = Choice { backend: self.selected.backend.as_ref(), reason: &self.selected.reason };
+        let choice = self.selected.choice();
         let read = |control: &Control<'_>| {
             let structure = structure::read_with(&self.input, &self.limits.read, control).map(Arc::new)?;
             if self.atom_table.is_some() {
@@ -135,7 +137,7 @@ impl<'a> CommandJob<'a> {
         write: impl Fn(&str, &[u8]) -> io::Result<()> + Sync,
     ) -> Result<TilesetReport, CliError> {
         let read = |control: &Control<'_>| structure::read_with(&self.input, &self.limits.read, control).map(Box::new);
-        let choice = Choice { backend: self.selected.backend.as_ref(), reason: &self.selected.reason };
+        let choice = self.selected.choice();
         let written =
             tileset::write(read, &self.options, &choice, &self.limits, &self.control(), &self.progress, write);
         written.map_err(|error| self.write_failure(folder, self.path, error))
@@ -150,7 +152,7 @@ impl<'a> CommandJob<'a> {
         folder: &Path,
         write: impl Fn(&str, &[u8]) -> io::Result<()> + Sync,
     ) -> Result<TilesetReport, CliError> {
-        let choice = Choice { backend: self.selected.backend.as_ref(), reason: &self.selected.reason };
+        let choice = self.selected.choice();
         let current = Cell::new(0);
         let scratch = scratch.map(|file| ScratchFile { file, meter: Arc::new(()) });
         let source = StreamSource::Files(files);
@@ -276,10 +278,14 @@ pub(super) fn failure(source: JobError, path: &Path, input: &[u8], limits: &JobL
     CliError::Job { name: name_of(path), strict_finding, source }
 }
 
-/// Sets the number of the global threads, on which reading, exact areas and colours run.
+/// Checks the value of `--threads` and sets the number of the global threads, on which reading, exact areas and colours
+/// run.
 pub(super) fn set_threads(n: Option<usize>) -> Result<(), CliError> {
-    backend::check_threads(n)?;
     let Some(n) = n else { return Ok(()) };
+    if !(1..=MAX_THREADS).contains(&n) {
+        let message = format!("parameter `threads`: {n} is not allowed; expected a number from 1 to {MAX_THREADS}");
+        return Err(CliError::usage(message));
+    }
     let built = rayon::ThreadPoolBuilder::new().num_threads(n).build_global();
     built.map_err(|error| CliError::Internal(error.to_string()))
 }

@@ -16,8 +16,7 @@ use super::request;
 pub(super) fn run(args: &MeshArgs) -> Result<(), CliError> {
     let request = request::parse_mesh(args)?;
     let format = request.format;
-    let paths = (args.input.as_path(), args.output.as_path());
-    let (mut job, mut output) = CommandJob::prepare(request, paths, &args.job)?;
+    let (mut job, mut output) = CommandJob::prepare(request, &args.input, &args.output, &args.job)?;
     if let Some(path) = &args.atoms {
         job.add_atom_table(path, &args.output)?;
     }

@@ -15,8 +15,7 @@ use super::request;
 pub(super) fn run(args: &RenderArgs) -> Result<(), CliError> {
     let request = request::parse_render(args)?;
     require_png(&args.output)?;
-    let paths = (args.input.as_path(), args.output.as_path());
-    let (job, mut output) = CommandJob::prepare(request, paths, &args.job)?;
+    let (job, mut output) = CommandJob::prepare(request, &args.input, &args.output, &args.job)?;
     let mut product = job.run(None).map_err(|source| job.failure(source))?;
     job.draw(&mut product).map_err(|source| job.failure(source))?;
     let start = Instant::now();

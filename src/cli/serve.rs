@@ -2,18 +2,16 @@
 
 use std::io::{self, Write};
 use std::num::NonZero;
-use std::sync::Arc;
 use std::time::Duration;
 
 use molmesh::config::{Loaded, LogFormat};
-use molmesh::http::{Chosen, ServeError, Server, Stopped, has_viewer, shutdown_signals};
+use molmesh::http::{ServeError, Server, Stopped, has_viewer, shutdown_signals};
 use molmesh::store::LockError;
 use molmesh::structure::strict_validator;
-use molmesh::surface::Backend;
 use molmesh::telemetry;
 
 use super::args::ServeArgs;
-use super::backend::{self, BackendRequest, SelectedBackend};
+use super::backend::{self, BackendRequest};
 use super::banner::{self, Facts};
 use super::error::CliError;
 use super::style::Style;
@@ -37,12 +35,10 @@ pub(super) fn run(args: &ServeArgs) -> Result<(), CliError> {
     strict_validator::quiet_panics();
     let selected = backend::select(&BackendRequest::for_service(args.backend, &config.devices))?;
     let others = survey::backends(&selected).into_iter().chain(survey::unused_devices(&selected)).collect();
-    let SelectedBackend { backend, reason, renderer, devices, .. } = selected;
-    let backend: Arc<dyn Backend> = Arc::from(backend);
     let keys = config.access.keys_file.is_some();
     let facts = Facts {
-        device: survey::describe(backend.as_ref()),
-        reason: reason.clone(),
+        device: survey::describe(selected.backend.as_ref()),
+        reason: selected.reason.clone(),
         others,
         keys,
         viewer: has_viewer(),
@@ -57,15 +53,12 @@ pub(super) fn run(args: &ServeArgs) -> Result<(), CliError> {
         .build()
         .map_err(failed)?;
     lower_compute_priority();
-    let server =
-        runtime.block_on(Server::bind(config, Chosen { backend, reason, renderer, devices })).map_err(|error| {
-            match error {
-                // Keys and secrets are part of the configuration.
-                ServeError::Access(error) => CliError::usage(error.to_string()),
-                ServeError::Lock(error @ LockError::Held { .. }) => CliError::InUse(error.to_string()),
-                error => CliError::Service(error.to_string()),
-            }
-        })?;
+    let server = runtime.block_on(Server::bind(config, selected)).map_err(|error| match error {
+        // Keys and secrets are part of the configuration.
+        ServeError::Access(error) => CliError::usage(error.to_string()),
+        ServeError::Lock(error @ LockError::Held { .. }) => CliError::InUse(error.to_string()),
+        error => CliError::Service(error.to_string()),
+    })?;
     if json {
         let metrics = server.metrics_addr().map(|addr| addr.to_string());
         tracing::info!(address = %server.addr(), metrics, device = facts.device, reason = facts.reason, "listening");

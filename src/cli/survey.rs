@@ -1,10 +1,9 @@
 //! Backends and devices with their states, for the banner and `doctor`.
 
+use molmesh::pipeline::SelectedBackend;
 use molmesh::surface::Backend;
 use molmesh::surface::cpu::CpuBackend;
 use molmesh::surface::reference::ReferenceBackend;
-
-use super::backend::SelectedBackend;
 
 /// State of a backend or of one of its devices.
 pub(crate) struct Availability {

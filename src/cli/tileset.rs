@@ -27,8 +27,8 @@ pub(super) fn run(args: &TilesetArgs) -> Result<(), CliError> {
     let input = args.inputs.first().map_or(Path::new("-"), PathBuf::as_path);
     let scratch = args.scratch.as_deref().map(|scratch| StreamFiles::open(&args.inputs, scratch)).transpose()?;
     let open = |_: &_| Folder::create(&args.output);
-    let input = (input, scratch.as_ref().map(|files| files.atoms));
-    let (job, mut folder) = CommandJob::prepare_for(Purpose::Mesh, request, input, &args.job, open)?;
+    let streamed_atoms = scratch.as_ref().map(|files| files.atoms);
+    let (job, mut folder) = CommandJob::prepare_for(Purpose::Mesh, request, input, streamed_atoms, &args.job, open)?;
     let write = |path: &str, bytes: &[u8]| folder.write(path, bytes);
     let report = match scratch {
         Some(StreamFiles { inputs, scratch, .. }) => {

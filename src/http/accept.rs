@@ -132,7 +132,7 @@ pub(super) async fn serve(
             MAX_TIME_FACTOR * write_timeout,
             Arc::clone(&pace),
         );
-        let run = connection(stream, (peer, pace), router.clone(), Arc::clone(&config), budget.clone(), stop.clone());
+        let run = connection(stream, peer, pace, router.clone(), Arc::clone(&config), budget.clone(), stop.clone());
         connections.spawn(run);
     }
     drop(listener);
@@ -222,7 +222,8 @@ impl Drop for Working {
 /// Serves one connection.
 async fn connection(
     stream: Guarded<(ConnectionSlot, GaugeGuard, Buffers)>,
-    (peer, pace): (Peer, Arc<Pace>),
+    peer: Peer,
+    pace: Arc<Pace>,
     router: Router,
     config: Arc<ServerConfig>,
     budget: Budget,

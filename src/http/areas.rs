@@ -35,9 +35,8 @@ pub(super) async fn list(request: DocumentRequest, query: Pairs) -> Result<Respo
     let surface = app.config.limits.job().surface;
     let write = async |loaded: Loaded, delivery| {
         let listing = loaded.list_atoms(app, caller, delivery, move |structure, limits, control, memory| {
-            let refused = |error| Problem::from(Failure::Job { error, diagnostics: Vec::new() });
-            let areas =
-                areas::measure_selection(structure, &options, limits, &surface, control).map_err(refused)?.areas;
+            let measured = areas::measure_selection(structure, &options, limits, &surface, control);
+            let areas = measured.map_err(Failure::from)?.areas;
             document::collect(memory, control, |out| areas.write_csv(structure, level, control, out))
         });
         Ok(([(header::CONTENT_TYPE, "text/csv")], Body::from(listing.await?)).into_response())

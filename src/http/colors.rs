@@ -51,7 +51,7 @@ pub(super) async fn list(request: DocumentRequest, query: Pairs) -> Result<Respo
     let variant = params::canonical(&options);
     let write = async |loaded: Loaded, delivery| {
         let etag = source::etag(&loaded.digest, &variant)?;
-        let (colors, legend) = write_list(app, caller, (loaded, delivery), options, coloring).await?;
+        let (colors, legend) = write_list(app, caller, loaded, delivery, options, coloring).await?;
         let described =
             [(header::CONTENT_TYPE, HeaderValue::from_static("application/octet-stream")), (LEGEND, legend)];
         Ok((described, part_of(&colors, headers, &etag)?).into_response())
@@ -63,7 +63,8 @@ pub(super) async fn list(request: DocumentRequest, query: Pairs) -> Result<Respo
 async fn write_list(
     app: &Shared,
     caller: &Caller,
-    (loaded, delivery): (Loaded, Delivery),
+    loaded: Loaded,
+    delivery: Delivery,
     options: Options,
     coloring: Coloring,
 ) -> Result<(Bytes, HeaderValue), Problem> {

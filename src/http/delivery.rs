@@ -101,7 +101,7 @@ pub(super) fn requested_part(
     }
 }
 
-/// Sends the mesh as `format`. `permit` is dropped after the last byte was written.
+/// Sends the mesh as `format`. `delivery` is dropped after the last byte was written.
 pub(super) async fn mesh(
     app: &App,
     finished: Arc<Finished>,

@@ -97,14 +97,21 @@ fn unreadable(error: &multer::Error, body: &Exceeded) -> Problem {
     }
 }
 
+/// Received map.
+pub(super) struct UploadedMap {
+    pub(super) bytes: Bytes,
+    /// SHA-256 of `bytes`.
+    pub(super) digest: Digest,
+}
+
 /// Received structure file.
 pub(super) struct UploadedFile {
     pub(super) bytes: Bytes,
     /// SHA-256 of `bytes`.
     pub(super) digest: Digest,
     pub(super) reservation: MemoryReservation,
-    /// Map from the field `map` of a form, with its SHA-256.
-    pub(super) map: Option<(Digest, Bytes)>,
+    /// Map from the field `map` of a form.
+    pub(super) map: Option<UploadedMap>,
     /// Parameters from the other fields of a form.
     pub(super) fields: Vec<(String, String)>,
     /// Content type of the file.
@@ -171,7 +178,7 @@ pub(super) async fn read(
         if is_structure {
             file = Some((content.freeze(), hasher.digest(&reservation).await?, declared));
         } else if is_map {
-            map = Some((hasher.digest(&reservation).await?, content.freeze()));
+            map = Some(UploadedMap { bytes: content.freeze(), digest: hasher.digest(&reservation).await? });
         } else {
             fields.push((name, String::from_utf8_lossy(&content).into_owned()));
         }

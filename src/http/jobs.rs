@@ -21,6 +21,7 @@ use super::openapi::problem_responses;
 use super::openapi::problems::ProblemDocument;
 use super::problem::Problem;
 use super::problem_types::ProblemType;
+use super::results;
 use super::state::Shared;
 use super::stop::{self, Stop};
 use crate::jobs::{ContentKey, JobId, JobRecord, JobView, Status, is_stored, rfc3339};
@@ -229,7 +230,7 @@ pub(super) async fn result(State(app): State<Shared>, caller: Caller, id: JobId)
             if !is_stored(&app.store, format, &key).await? {
                 return Err(gone());
             }
-            let location = delivery::text(&format!("/v1/results/{key}.{}", record.format));
+            let location = delivery::text(&results::path(&key, &record.format));
             Ok((StatusCode::SEE_OTHER, [(header::LOCATION, location)]).into_response())
         }
         (Status::Failed, _) => Err(Problem::recorded(record.problem.as_ref())),

@@ -16,6 +16,7 @@ use axum::response::{IntoResponse, Response};
 use bytes::Bytes;
 use tracing::Instrument as _;
 
+use super::guard::Caller;
 use super::parsed_request::{Pairs, ParsedRequest};
 use super::preferences::{PREFERENCE_APPLIED, RequestPreferences};
 use super::problem::Problem;
@@ -31,10 +32,13 @@ use crate::telemetry::{SpanParent, TraceSpan};
 /// Request for a mesh or its report.
 pub(super) struct MeshRequest {
     app: Shared,
+    caller: Caller,
     method: Method,
     /// Conditions and the range of a GET request; empty for an upload.
     headers: HeaderMap,
     parsed: ParsedRequest,
+    /// True if the response is the report instead of the mesh.
+    report: bool,
     preferences: RequestPreferences,
     /// `Cache-Control` of the response; `None` if it belongs to this request alone.
     cache: Option<HeaderValue>,
@@ -50,11 +54,13 @@ impl FromRequestParts<Shared> for MeshRequest {
         let path = source::path_parameters(parts, app).await?;
         let file = path.iter().find_map(|(name, value)| (name == "file").then_some(value));
         let query = Pairs::from_request_parts(parts, app).await?;
-        let preferences = RequestPreferences::of(&parts.headers, &parts.extensions)?;
+        let caller = Caller::of(&parts.extensions);
+        let preferences = RequestPreferences::of(&parts.headers, caller.client)?;
         let structure = StructureSource::from_request_parts(parts, app).await?;
         let parsed = ParsedRequest::from_address(app, structure, file, query)?;
-        let (method, headers) = (parts.method.clone(), parts.headers.clone());
-        Ok(Self { app: Arc::clone(app), method, headers, parsed, preferences, cache: Some(source::CACHE), timing })
+        let (app, method, headers) = (Arc::clone(app), parts.method.clone(), parts.headers.clone());
+        let (report, cache) = (file.is_none(), Some(source::CACHE));
+        Ok(Self { app, caller, method, headers, parsed, report, preferences, cache, timing })
     }
 }
 
@@ -62,22 +68,25 @@ impl MeshRequest {
     /// Creates the request of an upload, whose reception began with `timing`.
     pub(super) fn from_upload(
         app: Shared,
+        caller: Caller,
         parsed: ParsedRequest,
+        report: bool,
         preferences: RequestPreferences,
         timing: Timing,
     ) -> Self {
-        Self { app, method: Method::POST, headers: HeaderMap::new(), parsed, preferences, cache: None, timing }
+        let (method, headers) = (Method::POST, HeaderMap::new());
+        Self { app, caller, method, headers, parsed, report, preferences, cache: None, timing }
     }
 
     /// Answers the request.
     pub(super) async fn answer(mut self) -> Result<Response, Problem> {
-        let digest = self.parsed.source.digest(&self.app, &self.preferences.caller).await?;
+        let digest = self.parsed.source.digest(&self.app, &self.caller).await?;
         self.timing.lap("receive");
         if let Some(response) = self.without_work(&digest).await? {
             return Ok(response);
         }
         self.timing.lap("lookup");
-        let (source, caller) = (&self.parsed.source, &self.preferences.caller);
+        let (source, caller) = (&self.parsed.source, &self.caller);
         // The strict validator and the record of a job need the file.
         let loaded = if self.parsed.request.strict || self.is_answered_with_job() {
             source.load(&self.app, caller).await?
@@ -90,11 +99,11 @@ impl MeshRequest {
 
     /// Returns a response that needs no job: a stored result, a 304, or the headers for a HEAD request.
     async fn without_work(&self, digest: &Digest) -> Result<Option<Response>, Problem> {
-        let Self { app, method, headers, .. } = self;
-        let ParsedRequest { request, report, declared, .. } = &self.parsed;
+        let Self { app, method, headers, report, .. } = self;
+        let ParsedRequest { request, declared, .. } = &self.parsed;
         // Strict checks and reports need a run, a declared format is checked by parsing, and a job has its own address.
         let is_reusable = !request.strict && !report && !declared.is_structure() && !self.preferences.respond_async;
-        let namespace = self.preferences.caller.namespace;
+        let namespace = self.caller.namespace;
         let key =
             |arithmetic: String| ContentKey::new(digest, &request.options, request.format, &arithmetic, namespace);
         // Any backend may compute the file, and the key depends on the backend.
@@ -122,12 +131,11 @@ impl MeshRequest {
                 return Ok(Some((StatusCode::NOT_MODIFIED, caching).into_response()));
             }
             for key in &keys {
-                let stored =
-                    match results::stored(app, &self.preferences.caller, key, request.format, method, headers).await {
-                        // The store has logged its error. The mesh is computed again.
-                        Err(problem) if problem.is(ProblemType::StoreFailed) => break,
-                        stored => stored?,
-                    };
+                let stored = match results::stored(app, &self.caller, key, request.format, method, headers).await {
+                    // The store has logged its error. The mesh is computed again.
+                    Err(problem) if problem.is(ProblemType::StoreFailed) => break,
+                    stored => stored?,
+                };
                 if let Some(mut response) = stored {
                     response.headers_mut().remove(header::CACHE_CONTROL);
                     return Ok(Some(self.with_cache_control(response)));
@@ -158,18 +166,18 @@ impl MeshRequest {
     /// Returns true if the response is a job. A job has no report of its own to return later, so a request for a report
     /// is never answered with a job.
     fn is_answered_with_job(&self) -> bool {
-        self.preferences.respond_async && !self.parsed.report
+        self.preferences.respond_async && !self.report
     }
 
     /// Computes the mesh, or answers with a job.
     async fn compute(self, loaded: Loaded) -> Result<Response, Problem> {
         let app = Arc::clone(&self.app);
-        app.admit_work(&self.preferences.caller)?;
+        app.admit_work(&self.caller)?;
         if self.is_answered_with_job() {
             return self.accept(loaded, None).await;
         }
-        let report = self.parsed.report;
-        let permit = app.delivery(self.preferences.caller.client)?;
+        let report = self.report;
+        let permit = app.delivery(self.caller.client)?;
         let wait = self.preferences.wait.filter(|_| !report);
         let jobs = &app.config.jobs;
         let deadline = Duration::from_millis(jobs.deadline_ms);
@@ -191,7 +199,7 @@ impl MeshRequest {
                 }
             },
         };
-        let (digest, joined, namespace) = (loaded.digest, ticket.is_shared, self.preferences.caller.namespace);
+        let (digest, joined, namespace) = (loaded.digest, ticket.is_shared, self.caller.namespace);
         // Dropping the last ticket of unfinished work cancels it.
         drop((ticket, loaded));
         let finished = outcome.map_err(|failure| self.failed(failure))?;
@@ -229,7 +237,7 @@ impl MeshRequest {
         Task {
             input: loaded.input.clone(),
             digest: loaded.digest,
-            namespace: self.preferences.caller.namespace,
+            namespace: self.caller.namespace,
             strict: self.parsed.request.strict,
             options: self.parsed.request.options.clone(),
             rank: self.preferences.rank,
@@ -261,14 +269,14 @@ impl MeshRequest {
     /// Returns the durable job of the request. Loads the file of the structure if it is not in memory.
     async fn job_spec(&self, loaded: &mut Loaded) -> Result<JobSpec, Problem> {
         if loaded.input.file().is_none() {
-            *loaded = self.parsed.source.load(&self.app, &self.preferences.caller).await?;
+            *loaded = self.parsed.source.load(&self.app, &self.caller).await?;
         }
         let Input::File(file) = loaded.input.clone() else { return Err(Problem::internal("a file was not loaded")) };
         let ParsedRequest { pairs, map, request, .. } = &self.parsed;
         Ok(JobSpec {
             task: self.task(loaded),
             file,
-            map: map.clone(),
+            map: map.as_ref().map(|map| (map.digest, map.bytes.clone())),
             parameters: pairs.clone(),
             format: request.format,
             idempotency_key: self.preferences.idempotency_key.clone(),
@@ -288,6 +296,6 @@ impl MeshRequest {
 
     /// Recommends a job to a client whose request cannot be answered in time.
     fn advise(&self, problem: Problem) -> Problem {
-        if self.parsed.report { problem } else { problem.advise("send `Prefer: respond-async` to get a job") }
+        if self.report { problem } else { problem.advise("send `Prefer: respond-async` to get a job") }
     }
 }

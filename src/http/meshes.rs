@@ -5,7 +5,7 @@ use std::sync::Arc;
 use axum::body::Body;
 use axum::extract::State;
 use axum::http::header::HeaderMap;
-use axum::http::{Extensions, HeaderValue, header};
+use axum::http::{HeaderValue, header};
 use axum::response::Response;
 
 use super::guard::Caller;
@@ -34,10 +34,10 @@ pub(super) async fn create(
     State(app): State<Shared>,
     query: Pairs,
     headers: HeaderMap,
-    extensions: Extensions,
+    caller: Caller,
     body: Body,
 ) -> Result<Response, Problem> {
-    answer(&app, query, &headers, &extensions, body, false).await
+    answer(&app, caller, query, &headers, body, false).await
 }
 
 problem_responses!(ReportProblems: [BODY STRUCTURE ENTRY PARAMETERS READING MESHING WAITING]);
@@ -54,28 +54,28 @@ pub(super) async fn report(
     State(app): State<Shared>,
     query: Pairs,
     mut headers: HeaderMap,
-    extensions: Extensions,
+    caller: Caller,
     body: Body,
 ) -> Result<Response, Problem> {
     // `Accept` applies to the report, not to a mesh format.
     headers.remove(header::ACCEPT);
-    answer(&app, query, &headers, &extensions, body, true).await
+    answer(&app, caller, query, &headers, body, true).await
 }
 
 /// Answers an upload with its mesh or its report.
 async fn answer(
     app: &Shared,
+    caller: Caller,
     query: Pairs,
     headers: &HeaderMap,
-    extensions: &Extensions,
     body: Body,
     report: bool,
 ) -> Result<Response, Problem> {
     let timing = Timing::start();
-    let preferences = RequestPreferences::of(headers, extensions)?;
-    let caller = Caller::of(extensions);
-    let parsed = ParsedRequest { report, ..ParsedRequest::from_body(app, &caller, query, headers, body).await? };
-    let mut response = MeshRequest::from_upload(Arc::clone(app), parsed, preferences, timing).answer().await?;
+    let preferences = RequestPreferences::of(headers, caller.client)?;
+    let parsed = ParsedRequest::from_body(app, &caller, query, headers, body).await?;
+    let request = MeshRequest::from_upload(Arc::clone(app), caller, parsed, report, preferences, timing);
+    let mut response = request.answer().await?;
     if !report {
         response.headers_mut().append(header::VARY, HeaderValue::from_static("accept"));
     }

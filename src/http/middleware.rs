@@ -10,7 +10,9 @@
 //! 8. **origin**: rejects other hosts and pages of other sites;
 //! 9. **guard**: keys, signed URLs, quotas; removes keys and signatures from the request;
 //! 10. **timeout**: a backstop above the body timeout and the job deadline;
-//! 11. the router. Limits of bodies, queue and memory apply where the resource is used.
+//! 11. **reject parameters** (in `router`): rejects query parameters of operations that have none;
+//! 12. **relabel** (in `router`): sends a mesh as bytes if `Accept` prefers them;
+//! 13. the router. Limits of bodies, queue and memory apply where the resource is used.
 
 use std::panic::AssertUnwindSafe;
 use std::sync::Arc;

@@ -12,7 +12,6 @@ mod request_id;
 mod signal;
 mod socket;
 mod store_health;
-mod tilesets;
 mod timing;
 
 mod stop;
@@ -54,8 +53,9 @@ mod document;
 // Resources. `openapi` holds the parts of their description that they share.
 mod openapi;
 
-mod jobs;
 mod results;
+
+mod jobs;
 
 mod mesh_request;
 
@@ -70,6 +70,7 @@ mod metrics;
 mod page;
 mod problems;
 mod structures;
+mod tilesets;
 
 mod capabilities;
 
@@ -98,7 +99,7 @@ mod server;
 
 pub use crate::jobs::check_broker;
 pub use page::has_viewer;
-pub use server::{Chosen, ServeError, Server};
+pub use server::{ServeError, Server};
 pub use signing::check_signable;
 pub use stop::{Stop, shutdown_signals};
 pub use wind_down::Stopped;

@@ -114,6 +114,7 @@ operations! {
         GET "/version" OPEN None health::version;
     }
     each_structure: {
+        // The tiles of `/tileset.json` are `/surface.glb?tile=…`.
         "/{file}" MESH Mesh structures::surface;
         "/report.json" MESH Mesh structures::report;
         "/atoms" READ Atoms atoms::list;

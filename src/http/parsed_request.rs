@@ -4,10 +4,9 @@ use axum::body::Body;
 use axum::extract::{FromRequestParts, Query};
 use axum::http::header::HeaderMap;
 use axum::http::request::Parts;
-use bytes::Bytes;
 
 use super::content_type::{DeclaredType, contradiction};
-use super::form::UploadedFile;
+use super::form::{UploadedFile, UploadedMap};
 use super::guard::Caller;
 use super::problem::Problem;
 use super::problem_types::ProblemType;
@@ -17,7 +16,6 @@ use super::{json_body, negotiate, upload};
 use crate::formats::Format;
 use crate::pipeline::MapFile;
 use crate::pipeline::params::{self, Request};
-use crate::store::Digest;
 use crate::structure::detect_format;
 
 /// Size of a JSON document, bytes, up to which it is parsed on the async runtime: a few microseconds.
@@ -41,12 +39,10 @@ impl FromRequestParts<Shared> for Pairs {
 pub(super) struct ParsedRequest {
     pub(super) source: StructureSource,
     pub(super) request: Request,
-    /// Map of the job, with its digest.
-    pub(super) map: Option<(Digest, Bytes)>,
+    /// Map of the job.
+    pub(super) map: Option<UploadedMap>,
     /// Parameters as the client wrote them.
     pub(super) pairs: Vec<(String, String)>,
-    /// True if the response is the report instead of the mesh.
-    pub(super) report: bool,
     pub(super) declared: DeclaredType,
 }
 
@@ -59,9 +55,8 @@ impl ParsedRequest {
         Pairs(pairs): Pairs,
     ) -> Result<Self, Problem> {
         let request = parse_address(file, &pairs)?;
-        app.accepts(&request.options)?;
-        let report = file.is_none();
-        Ok(Self { source, request, map: None, pairs, report, declared: DeclaredType::Neutral })
+        app.check_options(&request.options)?;
+        Ok(Self { source, request, map: None, pairs, declared: DeclaredType::Neutral })
     }
 
     /// Receives a body: a structure file, a form with a file and perhaps a map, or a JSON document that names a
@@ -83,7 +78,7 @@ impl ParsedRequest {
             None
         } else {
             let request = parse(&pairs)?;
-            app.accepts(&request.options)?;
+            app.check_options(&request.options)?;
             Some(request)
         };
         let (source, fields, declared, map) = if is_json {
@@ -105,11 +100,11 @@ impl ParsedRequest {
         } else {
             pairs.extend(fields);
             let mut request = parse(&pairs)?;
-            request.options.map = map.as_ref().map(|(digest, bytes)| MapFile::new(digest.to_string(), bytes.clone()));
-            app.accepts(&request.options)?;
+            request.options.map = map.as_ref().map(|map| MapFile::new(map.digest.to_string(), map.bytes.clone()));
+            app.check_options(&request.options)?;
             request
         };
-        Ok(Self { source, request, map, pairs, report: false, declared })
+        Ok(Self { source, request, map, pairs, declared })
     }
 }
 

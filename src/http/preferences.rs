@@ -2,13 +2,12 @@
 
 use std::time::Duration;
 
+use axum::http::HeaderMap;
 use axum::http::header::HeaderName;
-use axum::http::{Extensions, HeaderMap};
 
-use super::guard::Caller;
 use super::problem::Problem;
 use super::problem_types::ProblemType;
-use crate::jobs::{DEFAULT_URGENCY, Rank};
+use crate::jobs::{Client, DEFAULT_URGENCY, Rank};
 
 /// `Prefer` (RFC 7240).
 pub(super) const PREFER: HeaderName = HeaderName::from_static("prefer");
@@ -29,13 +28,12 @@ pub(super) struct RequestPreferences {
     /// `wait=SECONDS`: answer with a job if the mesh takes longer. `None`: never answer with a job.
     pub(super) wait: Option<Duration>,
     pub(super) rank: Rank,
-    pub(super) caller: Caller,
     pub(super) idempotency_key: Option<String>,
 }
 
 impl RequestPreferences {
-    /// Reads the preferences of a request.
-    pub(super) fn of(headers: &HeaderMap, extensions: &Extensions) -> Result<Self, Problem> {
+    /// Reads the preferences of a request of `client`.
+    pub(super) fn of(headers: &HeaderMap, client: Client) -> Result<Self, Problem> {
         let preferences = || list(headers, PREFER);
         let wait = preferences().find_map(|p| parameter(p, "wait")?.parse().ok().map(Duration::from_secs));
         let respond_async = preferences().any(|p| p.eq_ignore_ascii_case("respond-async"));
@@ -43,9 +41,8 @@ impl RequestPreferences {
             .find_map(|p| parameter(p, "u")?.parse().ok())
             .filter(|u| (0..=7).contains(u))
             .unwrap_or(DEFAULT_URGENCY);
-        let caller = Caller::of(extensions);
-        let rank = Rank { client: caller.client, batch: respond_async, urgency };
-        Ok(Self { respond_async, wait, rank, caller, idempotency_key: key(headers)? })
+        let rank = Rank { client, batch: respond_async, urgency };
+        Ok(Self { respond_async, wait, rank, idempotency_key: key(headers)? })
     }
 }
 
@@ -86,7 +83,7 @@ mod tests {
         for (name, value) in headers {
             map.append(HeaderName::from_static(name), HeaderValue::from_static(value));
         }
-        RequestPreferences::of(&map, &Extensions::new())
+        RequestPreferences::of(&map, Client::default())
     }
 
     #[test]

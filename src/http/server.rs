@@ -26,10 +26,9 @@ use crate::jobs::{
     Broker, Client, EndError, JobStore, MemoryBroker, NatsBroker, Pool, ScratchSpace, Settings, Structures,
 };
 use crate::memory_budget::Budget;
-use crate::picture::SelectedRenderer;
+use crate::pipeline::SelectedBackend;
 use crate::single_flight::SingleFlight;
 use crate::store::{Digest, FolderLock, LockError, Secret, Store, StoreError, derive};
-use crate::surface::{Backend, FoundDevice};
 use crate::telemetry::{self, Recorder, TelemetryError, Traces};
 
 /// Interval of metrics upkeep.
@@ -78,18 +77,6 @@ pub enum ServeError {
     Telemetry(#[from] TelemetryError),
 }
 
-/// Backend and renderer of the service, with the reasons for their choice.
-pub struct Chosen {
-    /// Backend.
-    pub backend: Arc<dyn Backend>,
-    /// Reason for its choice.
-    pub reason: String,
-    /// Renderer of pictures.
-    pub renderer: SelectedRenderer,
-    /// Every device that was found, used or not.
-    pub devices: Vec<FoundDevice>,
-}
-
 /// A server with bound listeners and running workers.
 pub struct Server {
     app: Shared,
@@ -116,8 +103,8 @@ impl Server {
     ///
     /// # Errors
     /// [`ServeError`].
-    pub async fn bind(config: Config, chosen: Chosen) -> Result<Self, ServeError> {
-        let Chosen { backend, reason, renderer, devices: found } = chosen;
+    pub async fn bind(config: Config, selected: SelectedBackend) -> Result<Self, ServeError> {
+        let SelectedBackend { backend, reason, renderer, devices: found, .. } = selected;
         let access = Arc::new(Access::open(&config)?);
         if access.sites.lacks_origins() {
             tracing::warn!("pages of other origins are rejected: set access.cors_origins to their origins, or to none");

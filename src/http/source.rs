@@ -108,7 +108,7 @@ impl StructureSource {
         }
     }
 
-    /// Returns the structure in memory if there is one, for a `job` on a tile also as a part of its tileset, the
+    /// Returns the structure in memory if there is one, for `options` with a tile also as a part of its tileset, the
     /// tileset if its atoms are on disk, or the file. `digest` is the one that [`Self::digest`] returned for this
     /// caller, which has checked that the structure exists.
     pub(super) async fn find(

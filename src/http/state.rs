@@ -64,10 +64,9 @@ pub(super) struct App {
 }
 
 impl App {
-    /// Rejects a job that is invalid regardless of its input.
-    pub(super) fn accepts(&self, options: &Options) -> Result<(), Problem> {
-        let refused = |error| Failure::Job { error, diagnostics: Vec::new() };
-        options.check(&self.config.limits.job()).map_err(refused)?;
+    /// Rejects options that are invalid regardless of the input.
+    pub(super) fn check_options(&self, options: &Options) -> Result<(), Problem> {
+        options.check(&self.config.limits.job()).map_err(Failure::from)?;
         Ok(self.pool.settings().budget.reservation().check(options.picture.map_or(0, |picture| picture.bytes()))?)
     }
 

@@ -23,7 +23,7 @@ use crate::formats::tileset::{TileAddress, TilesetUris, assembly_document, subtr
 use crate::jobs::{CacheKey, Failure, Input, SharedStructure, SharedTileset};
 use crate::pipeline::params::ParamError;
 use crate::pipeline::tileset::AssemblyTileset;
-use crate::pipeline::{JobError, Options, StageClock, params};
+use crate::pipeline::{JobError, Options, StageClock, WorkScope, params};
 use crate::structure::ReadLimits;
 use crate::surface::{Control, SurfaceError};
 
@@ -78,7 +78,7 @@ impl FromRequestParts<Shared> for TilesetRequest {
             let expected = "no value for a tileset; POST /v1/report checks a file".to_owned();
             return Err(ParamError::BadValue { name: "check", value: "`strict`".to_owned(), expected }.into());
         }
-        app.accepts(&request.options)?;
+        app.check_options(&request.options)?;
         pairs.retain(|(name, _)| name != "tile");
         let options = request.options;
         Ok(Self { request: DocumentRequest::from_request_parts(parts, app).await?, pairs, options })
@@ -157,16 +157,16 @@ impl TilesetRequest {
         let variant = format!("{media_type}\n{}", params::canonical(&options));
         // Finds the tileset in the cache, as jobs on its tiles do.
         let tile_options = Options { tile: Some(TileAddress::ROOT), ..options.clone() };
-        let made = async |loaded: Loaded, delivery: Delivery| {
+        let respond = async |loaded: Loaded, delivery: Delivery| {
             let Loaded { input, digest, reservation } = loaded;
             let (shared, key) = (Arc::clone(app), (caller.namespace, digest));
-            let made = app.read(caller, (reservation, delivery), move |control| {
+            let reading = app.read(caller, (reservation, delivery), move |control| {
                 let limits = shared.config.limits.job().read;
                 write(&Preparation { app: &shared, key, input: &input, options: &options, limits, control })
             });
-            Ok(([(header::CONTENT_TYPE, media_type)], Body::from(made.await??)).into_response())
+            Ok(([(header::CONTENT_TYPE, media_type)], Body::from(reading.await??)).into_response())
         };
-        request.document(&variant, Some(&tile_options), made).await
+        request.document(&variant, Some(&tile_options), respond).await
     }
 }
 
@@ -192,7 +192,8 @@ impl Preparation<'_> {
     fn assembly(&self) -> Result<AssemblyTileset<SharedStructure>, Problem> {
         let Self { app, key: (namespace, digest), input, options, limits, control } = self;
         let read = |control: &Control<'_>| app.structures().get(*namespace, *digest, input, limits, control);
-        let assembly = AssemblyTileset::new(read, options, limits, control, &StageClock::new(&()));
+        let clock = StageClock::new(&());
+        let assembly = AssemblyTileset::new(read, options, limits, &WorkScope::new(&clock, control));
         Ok(assembly.map_err(Failure::from)?)
     }
 }

@@ -74,7 +74,7 @@ impl Backend {
             let failed = |reason| StoreError::Open { key: "store.url", location: url.clone(), reason };
             let (objects, bucket) = s3::connect(config, url).map_err(failed)?;
             let location = url.trim_end_matches('/').to_owned();
-            return Ok(Self::new(objects, StorageKind::S3(bucket), ("store.url", location), limit));
+            return Ok(Self::new(objects, StorageKind::S3(bucket), "store.url", location, limit));
         }
         let root = shared.map_or_else(|| folder_of(data_dir), PathBuf::from);
         let key = if shared.is_some() { "store.url" } else { "server.data_dir" };
@@ -97,13 +97,14 @@ impl Backend {
         let opened = opened.await.unwrap_or_else(|e| Err(e.to_string()));
         let failed = |reason| StoreError::Open { key, location: location.clone(), reason };
         let objects = Arc::new(opened.map_err(failed)?);
-        Ok(Self::new(objects, StorageKind::Local(root), (key, location), limit))
+        Ok(Self::new(objects, StorageKind::Local(root), key, location, limit))
     }
 
     fn new(
         objects: Arc<dyn ObjectStore>,
         kind: StorageKind,
-        (key, location): (&'static str, String),
+        key: &'static str,
+        location: String,
         limit: Duration,
     ) -> Self {
         Self { objects, kind, location, key, secret: OnceLock::new(), limit }
@@ -113,7 +114,7 @@ impl Backend {
     #[cfg(test)]
     pub(super) fn over(objects: Arc<dyn ObjectStore>, root: PathBuf, config: &StoreConfig) -> Self {
         let (location, limit) = (root.display().to_string(), Duration::from_millis(config.timeout_ms));
-        Self::new(objects, StorageKind::Local(root), ("server.data_dir", location), limit)
+        Self::new(objects, StorageKind::Local(root), "server.data_dir", location, limit)
     }
 
     /// Returns the location, for messages.

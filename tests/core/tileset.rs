@@ -7,7 +7,7 @@ use std::ops::Deref;
 
 use molmesh::formats::tileset::{TileAddress, assembly_document};
 use molmesh::pipeline::tileset::{AssemblyTileset, Tileset};
-use molmesh::pipeline::{Choice, JobError, JobLimits, Options, StageClock, params, run};
+use molmesh::pipeline::{Choice, JobError, JobLimits, Options, StageClock, WorkScope, params, run};
 use molmesh::structure::{self, ReadLimits, Structure};
 use molmesh::surface::{Control, CpuBackend, Limit, Measures, Mesh, SurfaceError, SurfaceLimits, Validation};
 use serde_json::Value;
@@ -23,13 +23,18 @@ struct Prepared {
 }
 
 impl Prepared {
+    /// Returns the grid spacing of a level, Å.
+    fn spacing(&self, level: u32) -> f64 {
+        self.bounds().error / f64::from(1_u32 << level)
+    }
+
     fn mesh(&self, tile: TileAddress) -> Option<Mesh> {
         let (backend, options) =
             (CpuBackend::new(Some(2)).unwrap(), Options { tile: Some(tile), ..self.options.clone() });
         let color = |coloring| self.tileset.colors(coloring, &Control::default()).unwrap();
         let colors = options.color.map(color);
         let limits = SurfaceLimits::default();
-        self.tileset.mesh((&options, colors.as_ref()), &backend, &limits, &Control::default()).unwrap()
+        self.tileset.mesh(&options, colors.as_ref(), &backend, &limits, &Control::default()).unwrap()
     }
 }
 
@@ -179,7 +184,8 @@ fn an_assembly_repeats_the_tilesets_of_its_units() {
     let read =
         |control: &Control<'_>| structure::read_with(text.as_bytes(), &ReadLimits::default(), control).map(Box::new);
     let clock = StageClock::new(&());
-    let assembly = AssemblyTileset::new(read, &options, &ReadLimits::default(), &Control::default(), &clock).unwrap();
+    let scope = WorkScope::new(&clock, &Control::default());
+    let assembly = AssemblyTileset::new(read, &options, &ReadLimits::default(), &scope).unwrap();
     let backend = CpuBackend::new(Some(2)).unwrap();
     let choice = Choice { backend: &backend, reason: "" };
     let (limits, control) = (JobLimits::default(), Control::default());
@@ -197,11 +203,18 @@ fn an_assembly_repeats_the_tilesets_of_its_units() {
         assert!(joined.closed && (joined.area / part.area - 1.0).abs() < 1e-6, "{} {}", joined.area, part.area);
     }
     // The root is the coarse mesh of all instances.
-    let root = assembly.root(&options, &limits, &choice, &control, &()).unwrap().report;
+    let root = assembly.root(&options, &limits, &choice, &scope).unwrap().report;
+    let (root_atoms, root_resolution) = (root.atoms, root.resolution);
     assert_eq!((root.atoms, root.instances.as_ref().unwrap().count), (whole.report.atoms, 3));
     assert_eq!(root.instances.unwrap().atoms_sum, whole.report.instances.unwrap().atoms_sum);
     assert_eq!(root.parts.iter().map(|part| part.atoms).collect::<Vec<_>>(), [454, 908]);
     assert!(root.closed && root.resolution == repeated.iter().map(|unit| unit.bounds.error).fold(0.0, f64::max));
+    // Its job reports the times of all stages, from reading on.
+    let options = params::parse(pairs.into_iter().chain([("tile", "0/0/0/0")])).unwrap().options;
+    let job = run(text.as_bytes(), &options, &limits, &choice, &control, &(), None).unwrap().report;
+    assert_eq!((job.atoms, job.resolution), (root_atoms, root_resolution));
+    let stages: Vec<&str> = job.timings_ms.keys().map(String::as_str).collect();
+    assert!(stages.starts_with(&["read", "select", "index"]) && stages.contains(&"field"), "{stages:?}");
     let document = assembly_document("root.glb", &repeated);
     let root = &document["root"];
     let children = root["children"].as_array().unwrap();
@@ -245,11 +258,12 @@ fn units_have_the_colours_and_the_small_parts_of_the_assembly() {
     let read =
         |control: &Control<'_>| structure::read_with(text.as_bytes(), &ReadLimits::default(), control).map(Box::new);
     let clock = StageClock::new(&());
-    let assembly = AssemblyTileset::new(read, &options, &ReadLimits::default(), &Control::default(), &clock).unwrap();
+    let scope = WorkScope::new(&clock, &Control::default());
+    let assembly = AssemblyTileset::new(read, &options, &ReadLimits::default(), &scope).unwrap();
     assert_eq!(assembly.color_range(), Some([5.0, 90.0]));
     let backend = CpuBackend::new(Some(2)).unwrap();
     let choice = Choice { backend: &backend, reason: "" };
-    let root = assembly.root(&options, &JobLimits::default(), &choice, &Control::default(), &()).unwrap().report;
+    let root = assembly.root(&options, &JobLimits::default(), &choice, &scope).unwrap().report;
     assert!(root.resolution > 8.0, "{}", root.resolution);
     assert_eq!((root.components, root.color.unwrap().range), (3, Some([5.0, 90.0])));
     // Each atom lies between the grid points of the roots, which do not group atoms.
@@ -264,9 +278,10 @@ fn units_have_the_colours_and_the_small_parts_of_the_assembly() {
     let read =
         |control: &Control<'_>| structure::read_with(text.as_bytes(), &ReadLimits::default(), control).map(Box::new);
     let clock = StageClock::new(&());
-    let assembly = AssemblyTileset::new(read, &options, &ReadLimits::default(), &Control::default(), &clock).unwrap();
+    let scope = WorkScope::new(&clock, &Control::default());
+    let assembly = AssemblyTileset::new(read, &options, &ReadLimits::default(), &scope).unwrap();
     let coarsest = assembly.repeated(|_| String::new())[0].bounds.error;
-    let root = assembly.root(&options, &JobLimits::default(), &choice, &Control::default(), &()).unwrap().report;
+    let root = assembly.root(&options, &JobLimits::default(), &choice, &scope).unwrap().report;
     assert_eq!((root.components, coarsest / root.resolution), (2, 2.0));
 }
 

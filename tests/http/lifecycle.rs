@@ -208,13 +208,14 @@ fn errors_of_an_address_in_use_name_the_key() {
     let server = running(&backend);
     let mut config = molmesh::config::Config::default();
     config.server.listen = server.addr;
-    let chosen = molmesh::http::Chosen {
+    let selected = molmesh::pipeline::SelectedBackend {
         backend,
         reason: String::new(),
         renderer: molmesh::picture::SelectedRenderer::cpu("set by a test"),
         devices: Vec::new(),
+        no_gpu: None,
     };
     let runtime = tokio::runtime::Runtime::new().unwrap();
-    let error = runtime.block_on(molmesh::http::Server::bind(config, chosen)).err().unwrap().to_string();
+    let error = runtime.block_on(molmesh::http::Server::bind(config, selected)).err().unwrap().to_string();
     assert!(error.contains("server.listen") && error.contains(&server.addr.to_string()), "{error}");
 }

@@ -11,8 +11,9 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use molmesh::config::Config;
-use molmesh::http::{Chosen, Server, Stop, Stopped};
+use molmesh::http::{Server, Stop, Stopped};
 use molmesh::picture::SelectedRenderer;
+use molmesh::pipeline::SelectedBackend;
 use molmesh::surface::{
     Backend, Control, Exceeded, FoundDevice, GridStats, Limit, Mesh, MeshOutput, MeshSink, Spheres, SurfaceError,
     SurfaceLimits, SurfaceParams,
@@ -243,8 +244,9 @@ pub(crate) fn start_after(
     change(&mut config);
     let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build().unwrap();
     let renderer = SelectedRenderer::cpu("set by a test");
-    let chosen = Chosen { backend, reason: "set by a test".to_owned(), renderer, devices: found };
-    let server = runtime.block_on(Server::bind(config, chosen)).unwrap();
+    let reason = "set by a test".to_owned();
+    let selected = SelectedBackend { backend, reason, renderer, devices: found, no_gpu: None };
+    let server = runtime.block_on(Server::bind(config, selected)).unwrap();
     prepare();
     let (addr, metrics) = (server.addr(), server.metrics_addr().unwrap());
     let (stop_sender, stop_receiver) = tokio::sync::watch::channel(Stop::Serve);

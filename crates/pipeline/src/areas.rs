@@ -14,7 +14,7 @@ use serde::Serialize;
 pub use self::table::AreaLevel;
 use self::table::Row;
 use super::load::{LoadedStructure, SPHERE_BYTES, load};
-use super::{JobError, LeftOutReport, Options, StageClock};
+use super::{JobError, LeftOutReport, Options, StageClock, WorkScope};
 
 /// Description of the values of `interface`.
 pub const EXPECTED: &str = "the chains of both sides, separated by a comma, such as A,B; several chains of a side are joined by a slash: H/L,A";
@@ -176,7 +176,7 @@ pub fn measure_selection(
     control: &Control<'_>,
 ) -> Result<MeasuredSelection, JobError> {
     let LoadedStructure { selected, spheres, .. } =
-        load(|_| Ok(structure), options, read, &StageClock::new(&()), control)?;
+        load(|_| Ok(structure), options, read, &WorkScope::new(&StageClock::new(&()), control))?;
     let (measures, areas) = if let Some(interface) = &options.interface {
         let (report, areas) = interface.measure(structure, &selected, &spheres, options, surface, control)?;
         (SelectionMeasures::Interface(report), areas)

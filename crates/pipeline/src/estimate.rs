@@ -22,7 +22,7 @@ use super::fit::{self, COARSE_FACTOR, MIN_COARSE_SPACING};
 use super::load::{LoadedStructure, load};
 use super::meshing::Meshing;
 use super::work::{self, WorkCounts};
-use super::{Choice, JobError, JobLimits, Options, StageClock};
+use super::{Choice, JobError, JobLimits, Options, StageClock, WorkScope};
 use super::{parts, pockets};
 
 /// Estimated size of a job.
@@ -81,7 +81,8 @@ pub fn estimate<S: Deref<Target = Structure>>(
         return Err(SurfaceError::BadParameter { name: "tile", value, expected }.into());
     }
     let clock = StageClock::new(&());
-    let LoadedStructure { structure, selected, spheres } = load(read, options, &limits.read, &clock, control)?;
+    let scope = WorkScope::new(&clock, control);
+    let LoadedStructure { structure, selected, spheres } = load(read, options, &limits.read, &scope)?;
     if let Some(coloring) = options.color.as_ref().filter(|coloring| !matches!(coloring.scheme, Scheme::Vertex(_))) {
         AtomColors::new(&structure, &selected.atoms, coloring)?;
     }

@@ -35,6 +35,7 @@ pub mod tileset;
 mod work;
 
 use std::ops::Deref;
+use std::sync::Arc;
 
 pub use areas::{AreaLevel, ExactReport, Interface, InterfaceReport, MeasuredSelection, SelectionMeasures};
 pub use auto::AutoBackend;
@@ -67,11 +68,11 @@ use load::{LoadedStructure, SPHERE_BYTES, load};
 use meshing::Meshing;
 use molmesh_formats::tileset::TileAddress;
 use molmesh_formats::{Compress, GlbSink, Normals, Packing, Step, Storage, Units};
-use molmesh_picture::PictureParams;
+use molmesh_picture::{PictureParams, SelectedRenderer};
 use molmesh_structure::{AtomPart, Context, Selection, Split, Structure, StructureError};
 use molmesh_surface::{
-    Backend, Control, MeshOutput, Pockets, SinkFailed, Spheres, SurfaceError, SurfaceParams, TriangleQuality,
-    Validation, lattice,
+    Backend, Control, FoundDevice, MeshOutput, Pockets, SinkFailed, Spheres, SurfaceError, SurfaceParams,
+    TriangleQuality, Validation, lattice,
 };
 use report::Counts;
 use steps::Steps;
@@ -221,6 +222,28 @@ pub struct Choice<'a> {
     pub reason: &'a str,
 }
 
+/// Backend and renderer in use, with the reasons for their choice.
+pub struct SelectedBackend {
+    /// Backend.
+    pub backend: Arc<dyn Backend>,
+    /// Reason for its choice.
+    pub reason: String,
+    /// Renderer of pictures; the CPU if no pictures are needed.
+    pub renderer: SelectedRenderer,
+    /// All discovered devices, used or not.
+    pub devices: Vec<FoundDevice>,
+    /// Reason for not using a GPU, if none is used.
+    pub no_gpu: Option<String>,
+}
+
+impl SelectedBackend {
+    /// Returns the backend with the reason for its choice.
+    #[must_use]
+    pub fn choice(&self) -> Choice<'_> {
+        Choice { backend: self.backend.as_ref(), reason: &self.reason }
+    }
+}
+
 /// Runs a job: reads `bytes`, selects atoms, meshes them on the chosen backend and measures the mesh. Reports to
 /// `progress`, not to the observer of `control`. The memory of the product stays added to the meter of `control`.
 ///
@@ -259,12 +282,12 @@ pub fn run_with<S: Deref<Target = Structure>>(
     let clock = StageClock::new(progress);
     let scope = WorkScope::new(&clock, control);
     if options.tile.is_none() {
-        let loaded = load(read, options, &limits.read, &clock, &scope.control)?;
+        let loaded = load(read, options, &limits.read, &scope)?;
         return run_loaded(loaded, options, limits, choice, &scope, sink);
     }
     if options.selection.instances {
-        let assembly = AssemblyTileset::new(read, options, &limits.read, control, &clock)?;
-        return assembly.root(options, limits, choice, control, progress);
+        let assembly = AssemblyTileset::new(read, options, &limits.read, &scope)?;
+        return assembly.root(options, limits, choice, &scope);
     }
     let tileset = Tileset::new(read, options, &limits.read, control, &clock)?;
     let colors = options.color.map(|coloring| tileset.colors(coloring, control)).transpose()?;

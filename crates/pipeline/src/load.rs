@@ -5,7 +5,7 @@ use std::ops::Deref;
 use molmesh_structure::{ReadLimits, Selected, Structure, StructureError};
 use molmesh_surface::{Control, Spheres, SurfaceError};
 
-use super::{JobError, Options, StageClock};
+use super::{JobError, Options, WorkScope};
 
 /// Memory of selecting, bytes per atom of the structure.
 const INDEX_BYTES: u64 = 8;
@@ -24,8 +24,7 @@ pub(super) fn load<S: Deref<Target = Structure>>(
     read: impl FnOnce(&Control<'_>) -> Result<S, StructureError>,
     options: &Options,
     limits: &ReadLimits,
-    clock: &StageClock<'_>,
-    control: &Control<'_>,
+    WorkScope { clock, control }: &WorkScope<'_>,
 ) -> Result<LoadedStructure<S>, JobError> {
     control.memory.also_held(options.map.as_ref().map_or(0, |map| map.as_ref().len() as u64));
     let structure = clock.time("read", || read(control))?;

@@ -7,8 +7,9 @@ use std::sync::{Arc, LazyLock};
 use std::time::Duration;
 
 use molmesh::config::Config;
-use molmesh::http::{Chosen, Server, Stop};
+use molmesh::http::{Server, Stop};
 use molmesh::picture::SelectedRenderer;
+use molmesh::pipeline::SelectedBackend;
 use molmesh::surface::CpuBackend;
 
 /// Words of requests. `{digest}`, `{key}` and `{job}` stand for a structure, a result and a job that exist.
@@ -167,14 +168,15 @@ fn start() -> Service {
     config.store.max_bytes = 64 << 20;
     config.store.memory_bytes = 4 << 20;
     let backend = Arc::new(CpuBackend::default());
-    let chosen = Chosen {
+    let selected = SelectedBackend {
         backend,
         reason: "fuzzing".to_owned(),
         renderer: SelectedRenderer::cpu("fuzzing"),
         devices: Vec::new(),
+        no_gpu: None,
     };
     let runtime = super::text::runtime();
-    let server = runtime.block_on(Server::bind(config, chosen)).expect("the server starts");
+    let server = runtime.block_on(Server::bind(config, selected)).expect("the server starts");
     let addr = server.addr();
     std::thread::spawn(move || {
         // Serves until the process ends: `orders` never changes.

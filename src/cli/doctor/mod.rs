@@ -9,11 +9,12 @@ mod page;
 use std::time::Duration;
 
 use molmesh::config::{Config, Loaded};
+use molmesh::pipeline::SelectedBackend;
 use molmesh::surface::FoundDevice;
 use serde_json::{Value, json};
 
 use super::args::{DoctorArgs, TextOrJson};
-use super::backend::{self, BackendRequest, SelectedBackend};
+use super::backend::{self, BackendRequest};
 use super::error::CliError;
 use super::report::json_text;
 use super::style::Style;

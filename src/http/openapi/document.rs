@@ -39,8 +39,14 @@ and `.`, or a new one.";
 )]
 struct Description;
 
-/// Returns the document as YAML and as JSON.
-pub(in crate::http) fn texts() -> Result<[Bytes; 2], String> {
+/// Texts of the document.
+pub(in crate::http) struct DocumentTexts {
+    pub(in crate::http) yaml: Bytes,
+    pub(in crate::http) json: Bytes,
+}
+
+/// Returns the texts of the document.
+pub(in crate::http) fn texts() -> Result<DocumentTexts, String> {
     let mut api = Description::openapi().merge_from(operations::Descriptions::openapi());
     entries::describe(&mut api);
     access::restrict_operations(&mut api);
@@ -48,5 +54,5 @@ pub(in crate::http) fn texts() -> Result<[Bytes; 2], String> {
     let mut document = serde_json::to_value(api).map_err(|error| error.to_string())?;
     components::share(&mut document).map_err(|error| error.to_string())?;
     let yaml = yaml::to_yaml(&document).map_err(|error| error.to_string())?;
-    Ok([yaml.into(), format!("{document:#}").into()])
+    Ok(DocumentTexts { yaml: yaml.into(), json: format!("{document:#}").into() })
 }

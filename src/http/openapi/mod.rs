@@ -11,5 +11,5 @@ pub(super) mod parameters;
 pub(super) mod problems;
 mod yaml;
 
-pub(super) use document::texts;
+pub(super) use document::{DocumentTexts, texts};
 pub(super) use problems::problem_responses;

@@ -133,7 +133,8 @@ impl<S: Deref<Target = Structure>> Tileset<S> {
         control: &Control<'_>,
         clock: &StageClock<'_>,
     ) -> Result<Self, JobError> {
-        let LoadedStructure { structure, selected, spheres } = load(read, options, limits, clock, control)?;
+        let scope = WorkScope::new(clock, control);
+        let LoadedStructure { structure, selected, spheres } = load(read, options, limits, &scope)?;
         clock.time("index", || {
             let params = options.params_for(spheres.len());
             let layout = Layout::of(&spheres, &params)?;
@@ -181,12 +182,6 @@ impl<S: Deref<Target = Structure>> Tileset<S> {
         &self.tiles
     }
 
-    /// Returns the grid spacing of a level, Å.
-    #[must_use]
-    pub fn spacing(&self, level: u32) -> f64 {
-        self.layout.spacing(level)
-    }
-
     /// Meshes the tile of `options`, or the root without one, adds skirts and encodes it. The mesh is empty if the
     /// surface does not pass through the tile. The memory of the product stays added to the meter of `scope`. Its
     /// report includes the times of its clock. `options` differs from that of [`Self::new`] in tile, colours and
@@ -202,7 +197,7 @@ impl<S: Deref<Target = Structure>> Tileset<S> {
         scope: &WorkScope<'_>,
     ) -> Result<Product, JobError> {
         let WorkScope { clock, control } = scope;
-        let (output, color) = self.output((options, colors), choice.backend, limits, scope)?;
+        let (output, color) = self.output(options, colors, choice.backend, limits, scope)?;
         let MeshOutput { mut mesh, grid, made_by, .. } = output;
         let address = options.tile.unwrap_or(TileAddress::ROOT);
         let (half, resolution) = (0.5 * self.layout.side(address.level), self.layout.spacing(address.level));
@@ -238,20 +233,22 @@ impl<S: Deref<Target = Structure>> Tileset<S> {
     /// Returns the errors of meshing.
     pub fn mesh(
         &self,
-        (options, colors): (&Options, Option<&TilesetColors>),
+        options: &Options,
+        colors: Option<&TilesetColors>,
         backend: &dyn Backend,
         limits: &SurfaceLimits,
         control: &Control<'_>,
     ) -> Result<Option<Mesh>, JobError> {
         let clock = StageClock::new(&());
-        let (output, _) = self.output((options, colors), backend, limits, &WorkScope::new(&clock, control))?;
+        let (output, _) = self.output(options, colors, backend, limits, &WorkScope::new(&clock, control))?;
         Ok(Some(output.mesh).filter(|mesh| mesh.n_triangles() > 0))
     }
 
     /// Meshes a tile and colours it.
     fn output(
         &self,
-        (options, colors): (&Options, Option<&TilesetColors>),
+        options: &Options,
+        colors: Option<&TilesetColors>,
         backend: &dyn Backend,
         limits: &SurfaceLimits,
         WorkScope { clock, control }: &WorkScope<'_>,

@@ -21,7 +21,7 @@ use super::stored::{SphereIndex, SphereList, StoredSphere};
 use crate::color::{BlockColors, Scheme};
 use crate::load::SPHERE_BYTES;
 use crate::params::ParamError;
-use crate::{JobError, Options, StageClock};
+use crate::{JobError, Options, StageClock, WorkScope};
 
 /// Buffer of the index, in blocks.
 const BUFFERED_BLOCKS: usize = 4;
@@ -118,17 +118,17 @@ struct BlockReader<'a> {
 }
 
 impl BlockReader<'_> {
-    /// Adds the atoms of a file. Reads blocks of about `block_bytes`.
+    /// Adds the atoms of the file `input`. Reads blocks of about `block_bytes`, with large columns in `columns`.
     fn read(
         &mut self,
-        (input, block_bytes): (Box<dyn Read + Send + '_>, usize),
-        file: &Arc<StoredBytes>,
-        control: &Control<'_>,
-        clock: &StageClock<'_>,
+        input: Box<dyn Read + Send + '_>,
+        block_bytes: usize,
+        columns: &Arc<StoredBytes>,
+        WorkScope { clock, control }: &WorkScope<'_>,
     ) -> Result<(), JobError> {
         self.selected.begin_file();
         let needs_secondary = self.options.color.is_some_and(|color| color.scheme == Scheme::SecondaryStructure);
-        let open = || Blocks::new(input, block_bytes, needs_secondary, file, self.limits, control);
+        let open = || Blocks::new(input, block_bytes, needs_secondary, columns, self.limits, control);
         let mut blocks = clock.time("read", open)?;
         loop {
             // Releases the memory of the block.
@@ -205,9 +205,10 @@ impl Tileset<Box<Structure>> {
         let mut reader = BlockReader { options, limits, selected, colors, spheres, head: None, assemblies, memory };
         match stream.source {
             StreamSource::Files(files) => {
+                let scope = WorkScope::new(clock, control);
                 for (number, input) in files.into_iter().enumerate() {
                     (stream.began)(number);
-                    reader.read((input, stream.block_bytes), &columns, control, clock)?;
+                    reader.read(input, stream.block_bytes, &columns, &scope)?;
                 }
             }
             StreamSource::Structure(structure) => {

@@ -12,7 +12,7 @@ use super::layout::{CELLS, Layout};
 use super::level::{Buckets, MIN_BUCKET, TilesetLevel};
 use crate::color::{AtomColors, Coloring, Scheme};
 use crate::load::{LoadedStructure, SPHERE_BYTES, load};
-use crate::{Choice, JobError, JobLimits, Options, Product, ProgressSink, Spacing, StageClock, WorkScope, run_loaded};
+use crate::{Choice, JobError, JobLimits, Options, Product, Spacing, WorkScope, run_loaded};
 
 /// Tileset of an assembly.
 pub struct AssemblyTileset<S> {
@@ -34,10 +34,10 @@ impl<S: Deref<Target = Structure>> AssemblyTileset<S> {
         read: impl FnOnce(&Control<'_>) -> Result<S, StructureError>,
         options: &Options,
         limits: &ReadLimits,
-        control: &Control<'_>,
-        clock: &StageClock<'_>,
+        scope: &WorkScope<'_>,
     ) -> Result<Self, JobError> {
-        let LoadedStructure { structure, selected, spheres } = load(read, options, limits, clock, control)?;
+        let LoadedStructure { structure, selected, spheres } = load(read, options, limits, scope)?;
+        let control = &scope.control;
         let bounds = |unit: &Unit| {
             control.check()?;
             let _spheres = control.reserve((SPHERE_BYTES + 4) * unit.rows.len() as u64)?;
@@ -83,8 +83,8 @@ impl<S: Deref<Target = Structure>> AssemblyTileset<S> {
         units.map(repeated).collect()
     }
 
-    /// Returns the job of the tileset of a unit, numbered from 1.
-    pub(super) fn job_of_unit(&self, options: &Options, number: usize) -> Options {
+    /// Returns the options of the tileset of a unit, numbered from 1.
+    pub(super) fn unit_options(&self, options: &Options, number: usize) -> Options {
         let unit = u32::try_from(number).ok().and_then(NonZeroU32::new);
         let selection = Selection { instances: false, unit, ..options.selection.clone() };
         self.colored(Options { selection, ..options.clone() })
@@ -99,7 +99,8 @@ impl<S: Deref<Target = Structure>> AssemblyTileset<S> {
     }
 
     /// Meshes the root: all instances at the coarsest grid spacing of the units, or at the next level at which the grid
-    /// does not miss the surface. Atoms are grouped as in coarse tiles.
+    /// does not miss the surface. Atoms are grouped as in coarse tiles. The report includes the times of the clock of
+    /// `scope`.
     ///
     /// # Errors
     /// Returns the errors of meshing and compression.
@@ -108,8 +109,7 @@ impl<S: Deref<Target = Structure>> AssemblyTileset<S> {
         options: &Options,
         limits: &JobLimits,
         choice: &Choice<'_>,
-        control: &Control<'_>,
-        progress: &dyn ProgressSink,
+        scope: &WorkScope<'_>,
     ) -> Result<Product, JobError> {
         let coarsest = self.bounds.iter().fold(0.0_f64, |most, bounds| most.max(bounds.error));
         let levels = self.bounds.iter().map(|bounds| bounds.levels).max().unwrap_or(1);
@@ -117,7 +117,7 @@ impl<S: Deref<Target = Structure>> AssemblyTileset<S> {
         loop {
             let spacing = coarsest / f64::from(1_u32 << level);
             level += 1;
-            match self.root_at(spacing, options, limits, choice, control, progress) {
+            match self.root_at(spacing, options, limits, choice, scope) {
                 Err(JobError::Surface(SurfaceError::NoSurface { .. })) if level < levels => {}
                 made => return made,
             }
@@ -131,15 +131,14 @@ impl<S: Deref<Target = Structure>> AssemblyTileset<S> {
         options: &Options,
         limits: &JobLimits,
         choice: &Choice<'_>,
-        control: &Control<'_>,
-        progress: &dyn ProgressSink,
+        scope: &WorkScope<'_>,
     ) -> Result<Product, JobError> {
-        let clock = StageClock::new(progress);
-        let (selected, spheres) = clock.time("index", || self.grouped(options, spacing, control))?;
+        let grouped = || self.grouped(options, spacing, &scope.control);
+        let (selected, spheres) = scope.clock.time("index", grouped)?;
         let params = SurfaceParams { resolution: spacing, ..options.params.clone() };
         let coarse = self.colored(Options { params, spacing: Spacing::Given, tile: None, ..options.clone() });
         let loaded = LoadedStructure { structure: &*self.structure, selected, spheres };
-        let mut product = run_loaded(loaded, &coarse, limits, choice, &WorkScope::new(&clock, control), None)?;
+        let mut product = run_loaded(loaded, &coarse, limits, choice, scope, None)?;
         // The groups represent all atoms.
         let report = &mut product.report;
         report.atoms = self.selected.atoms.len() as u64;

@@ -100,13 +100,13 @@ pub fn write<S: Deref<Target = Structure> + Sync>(
         let tileset = Tileset::new(read, options, &limits.read, control, &clock)?;
         return tileset.write(options, choice, &limits.surface, control, progress, store);
     }
-    let assembly = AssemblyTileset::new(read, options, &limits.read, control, &clock)?;
+    let assembly = AssemblyTileset::new(read, options, &limits.read, &WorkScope::new(&clock, control))?;
     let units = assembly.units();
     let mut all = TilesetReport::default();
     for (number, Unit { name, rows, operators, .. }) in (1..).zip(units) {
         // Releases all memory that is counted for the unit.
         let control = &control.metered();
-        let (options, structure) = (assembly.job_of_unit(options, number), &**assembly.structure());
+        let (options, structure) = (assembly.unit_options(options, number), &**assembly.structure());
         let tileset = Tileset::new(|_| Ok(structure), &options, &limits.read, control, &clock)?;
         let part = Part { sink: progress, index: number - 1, count: units.len() };
         let in_folder = |path: &str, bytes: &[u8]| store(&format!("{}/{path}", unit_folder(number)), bytes);
@@ -118,7 +118,9 @@ pub fn write<S: Deref<Target = Structure> + Sync>(
         all.bytes += report.bytes;
     }
     let root = format!("{}.glb", TileAddress::ROOT.path());
-    let product = assembly.root(options, limits, choice, control, &())?;
+    // The progress is that of the units.
+    let clock = StageClock::new(&());
+    let product = assembly.root(options, limits, choice, &WorkScope::new(&clock, control))?;
     all.bytes += store(&root, &glb_of(&product)?)?;
     let repeated = assembly.repeated(|number| format!("{}/tileset.json", unit_folder(number)));
     let document = assembly_document(&root, &repeated).to_string();
@@ -215,7 +217,7 @@ impl<S: Deref<Target = Structure> + Sync> Tileset<S> {
         if made.is_empty() {
             return Err(JobError::from(SurfaceError::NoSurface { isovalue: options.params.level() }).into());
         }
-        let level = |level| LevelReport { spacing: self.spacing(level), ..LevelReport::default() };
+        let level = |level| LevelReport { spacing: self.layout.spacing(level), ..LevelReport::default() };
         let mut levels: Vec<LevelReport> = (0..self.layout.levels).map(level).collect();
         for (address, triangles, bytes) in &made {
             let level = &mut levels[address.level as usize];
