@@ -14,7 +14,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let selection = Selection { atoms: expression.parse()?, ..Selection::default() };
     let bytes = std::fs::read(input)?;
     let selected = select(&read(&bytes, &ReadLimits::default())?, &selection)?;
-    println!("{} atoms, {} other atoms left out", selected.atoms.len(), selected.left_out.total());
+    println!("{} atoms, {} other atoms left out", selected.atoms.len(), selected.left_out.total);
     let mesh = molmesh::mesh(&bytes, &Options { selection, ..Options::default() })?;
     println!("{} vertices, {} triangles", mesh.n_vertices(), mesh.n_triangles());
     Ok(())

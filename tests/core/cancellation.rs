@@ -11,8 +11,8 @@ use molmesh::pipeline::{self, Choice, JobError, JobLimits, Options, ProgressSink
 use molmesh::structure::{self, ReadLimits, Selection};
 use molmesh::surface::lattice::Lattice;
 use molmesh::surface::{
-    Backend as _, CancelToken, Control, CpuBackend, Measures, MeshSink, Observer, Spheres, Stage, SurfaceError,
-    SurfaceKind, SurfaceLimits, SurfaceParams, Validation,
+    Backend as _, BackendJob, CancelToken, Control, CpuBackend, Measures, MeshSink, Observer, Spheres, Stage,
+    SurfaceError, SurfaceKind, SurfaceLimits, SurfaceParams, Validation,
 };
 
 /// Maximum time from the cancellation to the end of a job on an idle machine.
@@ -376,7 +376,9 @@ fn backends_end_soon_after_cancellation_in_any_stage() {
             let at = CancelIn::new(stage.name());
             let sink = GlbSink::new(&Discard);
             let sink = (stage == Stage::Write).then_some(&sink as &dyn MeshSink);
-            let stopped = backend.write(&spheres, &params, &SurfaceLimits::default(), &at.control(), sink);
+            let (limits, control) = (SurfaceLimits::default(), at.control());
+            let (spheres, params) = (&spheres, &params);
+            let stopped = backend.write(&BackendJob { spheres, params, limits: &limits, control: &control, sink });
             let time = at.time();
             assert_eq!(stopped.map(|_| ()).unwrap_err(), SurfaceError::Cancelled, "{}", stage.name());
             time

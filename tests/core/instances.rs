@@ -230,7 +230,7 @@ fn one_unit_is_meshed_where_it_is_in_the_file() {
         let mut expected = all.atoms[unit.rows.clone()].to_vec();
         expected.sort_unstable();
         assert_eq!((&own.atoms, own.copies.len(), own.units.len()), (&expected, 0, 0), "{number}");
-        assert_eq!(own.atoms.len() as u64 + own.left_out.total(), total);
+        assert_eq!(own.atoms.len() as u64 + own.left_out.total, total);
     }
     let missing = selected(false, Some(4)).unwrap_err().to_string();
     assert!(missing.contains("unit 4") && missing.contains("the units 1 to 3 in assembly 1"), "{missing}");

@@ -94,7 +94,7 @@ fn every_structure_and_surface_gives_a_closed_oriented_manifold() {
     let dir = tempfile::tempdir().unwrap();
     for case in cases() {
         let mut files = Vec::new();
-        for surface in SurfaceKind::ALL.iter().copied() {
+        for surface in SurfaceKind::ALL {
             for resolution in [1.0, 0.5] {
                 let what = format!("{} {surface} {resolution}", case.name);
                 let mesh = mesh(&case.spheres, surface, resolution, 2);
@@ -150,7 +150,7 @@ fn outward(mesh: &Mesh) -> f64 {
 #[test]
 fn the_same_bytes_with_1_2_and_7_threads_and_the_same_surface_permuted() {
     for case in cases() {
-        for surface in SurfaceKind::ALL.iter().copied() {
+        for surface in SurfaceKind::ALL {
             let one = mesh(&case.spheres, surface, 1.0, 1);
             for threads in [2, 7] {
                 assert!(one == mesh(&case.spheres, surface, 1.0, threads), "{} {surface} {threads} threads", case.name);

@@ -530,7 +530,7 @@ fn records(text: &str) -> u64 {
 
 fn meshed_and_left_out(s: &Structure, atoms: &str) -> u64 {
     let found = selected(s, atoms).unwrap();
-    found.atoms.len() as u64 + found.left_out.total()
+    found.atoms.len() as u64 + found.left_out.total
 }
 
 #[test]
@@ -545,7 +545,7 @@ fn every_atom_of_real_files_is_meshed_or_counted() {
         let all = s.len() as u64 + s.unread.blocks + s.unread.spheres;
         for atoms in ["polymer", "all", "ligand", "water and chain A"] {
             if let Ok(found) = selected(&s, atoms) {
-                assert_eq!(found.atoms.len() as u64 + found.left_out.total(), all, "{}: {atoms}", path.display());
+                assert_eq!(found.atoms.len() as u64 + found.left_out.total, all, "{}: {atoms}", path.display());
             }
         }
         if let Ok(text) = std::str::from_utf8(&bytes)

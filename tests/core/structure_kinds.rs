@@ -15,7 +15,9 @@ use std::collections::BTreeMap;
 use std::path::Path;
 use std::process::Command;
 
-use molmesh::structure::{Contents, Kind, LeftOut, ReadLimits, Selection, Structure, read, select};
+use molmesh::structure::{
+    Contents, Kind, KindCount, LeftOut, ReadLimits, ResidueCount, Selection, Structure, read, select,
+};
 
 const PDB: &str = include_str!("../../samples/4pti.pdb");
 const CIF: &str = include_str!("../../samples/1crn.cif");
@@ -33,6 +35,14 @@ fn selected(s: &Structure) -> Vec<u32> {
 
 fn left_out(s: &Structure) -> LeftOut {
     select(s, &Selection::default()).unwrap().left_out
+}
+
+fn kind(kind: Kind, atoms: u64) -> KindCount {
+    KindCount { kind: kind.name(), atoms }
+}
+
+fn residue(name: &str, kind: Kind, atoms: u64) -> ResidueCount {
+    ResidueCount { name: name.to_owned(), kind: kind.name(), atoms }
 }
 
 /// Returns the atom lines of the PDB sample.
@@ -229,8 +239,8 @@ fn a_residue_with_peptide_bonds_is_polymer() {
     // Control: the same residue 10 Å away is a ligand, unless the file lists it.
     let apart = structure(modified("MSE", "", 10.0));
     assert_eq!(selected(&apart).len(), POLYMER - 8);
-    assert_eq!(left_out(&apart).residues, [("HOH".to_owned(), Kind::Water, 60), ("MSE".to_owned(), Kind::Ligand, 8)]);
-    assert_eq!(left_out(&apart).kinds, [(Kind::Water, 60), (Kind::Ligand, 8)]);
+    assert_eq!(left_out(&apart).residues, [residue("HOH", Kind::Water, 60), residue("MSE", Kind::Ligand, 8)]);
+    assert_eq!(left_out(&apart).kinds, [kind(Kind::Water, 60), kind(Kind::Ligand, 8)]);
     for listed in ["SEQRES   5 A   58  ARG MSE CYS GLY GLY ALA\n", "MODRES 4PTI MSE A   52  MET  SELENOMETHIONINE\n"] {
         assert_eq!(selected(&structure(modified("MSE", listed, 10.0))).len(), POLYMER, "{listed}");
         let other_chain = listed.replace(" A   5", " B   5");
@@ -520,8 +530,8 @@ fn gemmi_and_biotite_assign_the_same_kinds() {
     assert_eq!((counts.polymer, counts.protein, counts.nucleic), (456, 454, 2));
     assert_eq!((counts.ligand, counts.cofactor, counts.glycan, counts.ion, counts.water), (8, 2, 2, 2, 60));
     let found = left_out(&s);
-    assert_eq!(found.kinds[..2], [(Kind::Water, 60), (Kind::Ligand, 4)]);
-    assert_eq!(found.total(), 70);
+    assert_eq!(found.kinds[..2], [kind(Kind::Water, 60), kind(Kind::Ligand, 4)]);
+    assert_eq!(found.total, 70);
     for (kind, (_, residue)) in s.kind.iter().zip(names(&s)) {
         expected.push((residue, kind.name().replace("cofactor", "ligand")));
     }
@@ -595,8 +605,8 @@ fn counts_virtual_sites_of_mmcif_separately() {
     let counts = Contents::of(&s, None).counts;
     assert_eq!((counts.polymer, counts.water, counts.hydrogens, counts.virtual_sites, counts.total()), (1, 1, 2, 1, 5));
     let left_out = left_out(&s);
-    assert_eq!((left_out.total(), left_out.virtual_sites), (4, 1));
-    assert_eq!(left_out.residues, [("SOL".to_owned(), Kind::Water, 3)]);
+    assert_eq!((left_out.total, left_out.virtual_sites), (4, 1));
+    assert_eq!(left_out.residues, [residue("SOL", Kind::Water, 3)]);
 }
 
 // ---- what is left out ----
@@ -614,18 +624,17 @@ fn counts_atoms_left_out_once_and_bounds_the_names() {
     let s = structure(&text);
     let found = left_out(&s);
     assert_eq!(found.residues.len(), 10);
-    let named = |name: &str, kind, n| (name.to_owned(), kind, n);
-    let first = [named("HOH", Kind::Water, 60), named("L14", Kind::Ligand, 15), named("L13", Kind::Ligand, 14)];
+    let first = [residue("HOH", Kind::Water, 60), residue("L14", Kind::Ligand, 15), residue("L13", Kind::Ligand, 14)];
     assert_eq!(found.residues[..3], first);
-    assert_eq!(found.kinds, [(Kind::Ligand, (1..=15).sum::<u64>()), (Kind::Water, 60)]);
+    assert_eq!(found.kinds, [kind(Kind::Ligand, (1..=15).sum()), kind(Kind::Water, 60)]);
     assert_eq!(found.other_residues, (1..=6).sum::<u64>());
     assert_eq!((found.hydrogens, found.alternatives, found.other_chains, found.virtual_sites), (1, 1, 0, 0));
-    assert_eq!(found.total() as usize + selected(&s).len(), s.len());
+    assert_eq!(found.total as usize + selected(&s).len(), s.len());
     let none = Selection { chains: Some(vec!["A".to_owned()]), ..Selection::default() };
     let other = structure(
         PDB.replace("END", "REMARK")
             + "ATOM      1  CA  ALA B   1       0.0     0.0     0.0    1.00  0.00           C\n",
     );
     let found = select(&other, &none).unwrap().left_out;
-    assert_eq!((found.other_chains, found.total()), (1, 61));
+    assert_eq!((found.other_chains, found.total), (1, 61));
 }

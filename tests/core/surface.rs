@@ -13,9 +13,9 @@ use crate::tools::shapes::Random;
 
 use molmesh::surface::reference::Density;
 use molmesh::surface::{
-    Backend, CancelToken, Control, CpuBackend, Kernel, Limit, Measures, Mesh, MeshOutput, MeshPart, MeshSink, Observer,
-    Quantized, ReferenceBackend, SinkFailed, Spheres, Stage, Step, SurfaceError, SurfaceLimits, SurfaceOptions,
-    SurfaceParams, Validation, Vertices, lattice,
+    Backend, BackendJob, CancelToken, Control, CpuBackend, Kernel, Limit, Measures, Mesh, MeshOutput, MeshPart,
+    MeshSink, Observer, Quantized, ReferenceBackend, SinkFailed, Spheres, Stage, Step, SurfaceError, SurfaceLimits,
+    SurfaceOptions, SurfaceParams, Validation, Vertices, lattice,
 };
 use std::collections::BTreeSet;
 use std::sync::Mutex;
@@ -557,8 +557,9 @@ fn a_sink_gets_the_same_mesh_as_memory() {
         for threads in [1, 3] {
             let sink = Collected::default();
             let backend = CpuBackend::new(Some(threads)).unwrap();
-            let limits = SurfaceLimits::default();
-            let output = backend.write(at, &p, &limits, &Control::default(), Some(&sink)).unwrap();
+            let (limits, control) = (SurfaceLimits::default(), Control::default());
+            let job = BackendJob { spheres: at, params: &p, limits: &limits, control: &control, sink: Some(&sink) };
+            let output = backend.write(&job).unwrap();
             let (mut mesh, received) = sink.0.into_inner().unwrap();
             assert_eq!(received, times * mesh.n_vertices(), "{h} Å");
             assert_eq!(mesh.quantized.is_some(), quantized);
@@ -587,7 +588,7 @@ fn quantized_vertices_are_rounded_once_and_measured_after_rounding() {
     let relative = |a: f64, b: f64| (a / b - 1.0).abs();
     for (at, h) in [(spheres(&Random(5).cloud(400, 50.0)), 0.5), (spheres(&[[900.0, 0.0, -77.0, 1.7]]), 0.3)] {
         for kernel in Kernel::ALL {
-            let single = params(*kernel, h);
+            let single = params(kernel, h);
             let whole = run(&at, &single);
             // The smallest step, and one so coarse that it changes area and volume.
             for step in [rounded(&at, &single).quantize.unwrap(), Step::covering(4000.0)] {
@@ -632,11 +633,8 @@ fn every_vertex_is_within_the_extent_known_in_advance() {
     for at in [spheres(&[[0.3, 0.2, 0.1, 1.7]]), spheres(&Random(8).cloud(60, 25.0)), far] {
         for kernel in Kernel::ALL {
             for h in [0.31, 1.0] {
-                let mut options = SurfaceOptions {
-                    surface: Some((*kernel).into()),
-                    resolution: Some(h),
-                    ..SurfaceOptions::default()
-                };
+                let mut options =
+                    SurfaceOptions { surface: Some(kernel.into()), resolution: Some(h), ..SurfaceOptions::default() };
                 // At a low level the surface is closest to the support of the densities.
                 for isovalue in [None, Some(0.001)] {
                     options.isovalue = isovalue;
@@ -672,9 +670,11 @@ fn a_sink_that_fails_ends_the_run() {
     }
     let at = spheres(&Random(6).cloud(900, 60.0));
     let p = params(Kernel::Gaussian, 0.5);
-    let (backend, limits) = (CpuBackend::new(Some(2)).unwrap(), SurfaceLimits::default());
+    let (limits, control) = (SurfaceLimits::default(), Control::default());
     for room in [0, usize::MAX] {
-        let error = backend.write(&at, &p, &limits, &Control::default(), Some(&Full(room))).unwrap_err();
+        let full = Full(room);
+        let job = BackendJob { spheres: &at, params: &p, limits: &limits, control: &control, sink: Some(&full) };
+        let error = CpuBackend::new(Some(2)).unwrap().write(&job).unwrap_err();
         assert_eq!(error, SurfaceError::Sink);
     }
 }

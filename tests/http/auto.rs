@@ -7,7 +7,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use http_support::{Fake, Mode, Reply, Running, SAMPLE, sample, send, start};
 use molmesh::pipeline::AutoBackend;
-use molmesh::surface::{Backend, Control, MeshOutput, MeshSink, Spheres, SurfaceError, SurfaceLimits, SurfaceParams};
+use molmesh::surface::{Backend, BackendJob, MeshOutput, SurfaceError};
 
 /// Fake backend with a name and, derived from it, an arithmetic of its own. It can fail.
 #[derive(Clone)]
@@ -26,18 +26,11 @@ impl Backend for Named {
         format!("the {}", self.name)
     }
 
-    fn write(
-        &self,
-        spheres: &Spheres,
-        params: &SurfaceParams,
-        limits: &SurfaceLimits,
-        control: &Control<'_>,
-        sink: Option<&dyn MeshSink>,
-    ) -> Result<MeshOutput, SurfaceError> {
+    fn write(&self, job: &BackendJob<'_>) -> Result<MeshOutput, SurfaceError> {
         if self.fails.load(Ordering::SeqCst) {
             return Err(SurfaceError::Device { why: "lost by a test".to_owned() });
         }
-        self.fake.write(spheres, params, limits, control, sink)
+        self.fake.write(job)
     }
 }
 

@@ -8,8 +8,8 @@ use std::time::Duration;
 
 use http_support::{Fake, Mode, SAMPLE, log_lines, send, start_on, wait_for};
 use molmesh::surface::{
-    Backend, BackendIdentity, Control, DeviceFacts, DeviceKind, DeviceStatus, Exceeded, FoundDevice, Limit, MeshOutput,
-    MeshSink, Spheres, SurfaceError, SurfaceLimits, SurfaceParams,
+    Backend, BackendIdentity, BackendJob, DeviceFacts, DeviceKind, DeviceStatus, Exceeded, FoundDevice, Limit,
+    MeshOutput, SurfaceError,
 };
 
 /// Backend with two devices, the second of which can fail.
@@ -53,14 +53,7 @@ impl Backend for Devices {
         "two devices".to_owned()
     }
 
-    fn write(
-        &self,
-        spheres: &Spheres,
-        params: &SurfaceParams,
-        limits: &SurfaceLimits,
-        control: &Control<'_>,
-        sink: Option<&dyn MeshSink>,
-    ) -> Result<MeshOutput, SurfaceError> {
+    fn write(&self, job: &BackendJob<'_>) -> Result<MeshOutput, SurfaceError> {
         if let Some(error) = self.error.lock().unwrap().clone() {
             return Err(error);
         }
@@ -71,7 +64,7 @@ impl Backend for Devices {
             None => self.served.lock().unwrap().map_or_else(|| self.arithmetic(), str::to_owned),
         };
         let made_by = Some(BackendIdentity { backend, arithmetic, device: device.to_owned(), fallback_reason });
-        Ok(MeshOutput { made_by, ..self.fake.write(spheres, params, limits, control, sink)? })
+        Ok(MeshOutput { made_by, ..self.fake.write(job)? })
     }
 
     fn warm_up(&self) -> Result<(), SurfaceError> {

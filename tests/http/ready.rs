@@ -13,9 +13,7 @@ use http_support::{
 };
 use molmesh::config::Config;
 use molmesh::http::Stop;
-use molmesh::surface::{
-    Backend, Control, DeviceStatus, MeshOutput, MeshSink, Spheres, SurfaceError, SurfaceLimits, SurfaceParams,
-};
+use molmesh::surface::{Backend, BackendJob, DeviceStatus, MeshOutput, SurfaceError};
 use serde_json::Value;
 use tempfile::TempDir;
 
@@ -211,15 +209,8 @@ impl Backend for OneDevice {
         "one device".to_owned()
     }
 
-    fn write(
-        &self,
-        spheres: &Spheres,
-        params: &SurfaceParams,
-        limits: &SurfaceLimits,
-        control: &Control<'_>,
-        sink: Option<&dyn MeshSink>,
-    ) -> Result<MeshOutput, SurfaceError> {
-        self.fake.write(spheres, params, limits, control, sink)
+    fn write(&self, job: &BackendJob<'_>) -> Result<MeshOutput, SurfaceError> {
+        self.fake.write(job)
     }
 
     fn devices(&self) -> Vec<DeviceStatus> {

@@ -15,8 +15,7 @@ use molmesh::http::{Server, Stop, Stopped};
 use molmesh::picture::SelectedRenderer;
 use molmesh::pipeline::SelectedBackend;
 use molmesh::surface::{
-    Backend, Control, Exceeded, FoundDevice, GridStats, Limit, Mesh, MeshOutput, MeshSink, Spheres, SurfaceError,
-    SurfaceLimits, SurfaceParams,
+    Backend, BackendJob, Exceeded, FoundDevice, GridStats, Limit, Mesh, MeshOutput, Spheres, SurfaceError,
 };
 
 /// Sample of the product.
@@ -83,14 +82,8 @@ impl Backend for Fake {
         "nothing".to_owned()
     }
 
-    fn write(
-        &self,
-        spheres: &Spheres,
-        params: &SurfaceParams,
-        _: &SurfaceLimits,
-        control: &Control<'_>,
-        sink: Option<&dyn MeshSink>,
-    ) -> Result<MeshOutput, SurfaceError> {
+    fn write(&self, job: &BackendJob<'_>) -> Result<MeshOutput, SurfaceError> {
+        let BackendJob { spheres, params, control, sink, .. } = *job;
         let warm_up = spheres.len() == 1 && !self.also_warm.load(Ordering::SeqCst);
         let mode = if warm_up { Mode::Octahedra } else { *self.mode.lock().unwrap() };
         if !warm_up {

@@ -8,10 +8,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::Duration;
 
-use molmesh::surface::{
-    Backend, BackendIdentity, Control, DeviceStatus, MeshOutput, MeshSink, Spheres, SurfaceError, SurfaceLimits,
-    SurfaceParams,
-};
+use molmesh::surface::{Backend, BackendIdentity, BackendJob, DeviceStatus, MeshOutput, SurfaceError};
 use molmesh::telemetry::{Metric, MetricKind};
 
 use crate::http_support::{Fake, Mode};
@@ -142,18 +139,11 @@ impl Backend for Devices {
         "a device".to_owned()
     }
 
-    fn write(
-        &self,
-        spheres: &Spheres,
-        params: &SurfaceParams,
-        limits: &SurfaceLimits,
-        control: &Control<'_>,
-        sink: Option<&dyn MeshSink>,
-    ) -> Result<MeshOutput, SurfaceError> {
+    fn write(&self, job: &BackendJob<'_>) -> Result<MeshOutput, SurfaceError> {
         let fallback_reason = Some("fallback of a test".to_owned());
         let (arithmetic, device) = ("cpu".to_owned(), "the processor".to_owned());
         let made_by = Some(BackendIdentity { backend: "cpu", arithmetic, device, fallback_reason });
-        Ok(MeshOutput { made_by, ..self.0.write(spheres, params, limits, control, sink)? })
+        Ok(MeshOutput { made_by, ..self.0.write(job)? })
     }
 
     fn devices(&self) -> Vec<DeviceStatus> {

@@ -45,7 +45,7 @@ pub(crate) struct PaperArgs {
     #[arg(long, value_name = "IDS", value_delimiter = ',')]
     only: Vec<String>,
     /// Measure only these kernels: gaussian, soft-object, inverse-square
-    #[arg(long, value_name = "LIST", value_delimiter = ',')]
+    #[arg(long, value_name = "LIST", value_delimiter = ',', value_parser = kernel)]
     kernels: Vec<Kernel>,
     /// Number of measured runs of each program on each structure; at most three of the reference, or one if it is slow
     #[arg(long, value_name = "N", default_value_t = 7)]
@@ -71,6 +71,10 @@ pub(crate) struct PaperArgs {
     /// Write paper.json and paper.md to this folder
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
+}
+
+fn kernel(name: &str) -> std::result::Result<Kernel, String> {
+    Kernel::named(name).ok_or_else(|| format!("expected one of {}", Kernel::NAMES.join(", ")))
 }
 
 /// Selected measurements.

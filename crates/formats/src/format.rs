@@ -1,8 +1,8 @@
 //! Output formats with their names, file extensions and media types.
 
-use std::fmt;
 use std::str::FromStr;
 
+use molmesh_surface::named;
 use thiserror::Error;
 
 /// Format of an output file: a mesh or a picture of one.
@@ -36,21 +36,10 @@ pub enum Format {
 #[error("unknown format `{0}`; expected one of glb, gltf, ply, ply-text, stl, obj, vtp, vert, face, png")]
 pub struct UnknownFormat(pub String);
 
-impl Format {
-    /// Every format.
-    pub const ALL: [Self; 10] = [
-        Self::Glb,
-        Self::Gltf,
-        Self::Ply,
-        Self::PlyText,
-        Self::Stl,
-        Self::Obj,
-        Self::Vtp,
-        Self::Vert,
-        Self::Face,
-        Self::Png,
-    ];
+named!(Format, Glb => "glb", Gltf => "gltf", Ply => "ply", PlyText => "ply-text", Stl => "stl", Obj => "obj",
+    Vtp => "vtp", Vert => "vert", Face => "face", Png => "png");
 
+impl Format {
     /// Formats that hold a mesh.
     pub const MESHES: [Self; 9] =
         [Self::Glb, Self::Gltf, Self::Ply, Self::PlyText, Self::Stl, Self::Obj, Self::Vtp, Self::Vert, Self::Face];
@@ -61,23 +50,6 @@ impl Format {
         match self {
             Self::PlyText => "ply",
             _ => self.name(),
-        }
-    }
-
-    /// Name as a parameter and in addresses.
-    #[must_use]
-    pub const fn name(self) -> &'static str {
-        match self {
-            Self::Glb => "glb",
-            Self::Gltf => "gltf",
-            Self::Ply => "ply",
-            Self::PlyText => "ply-text",
-            Self::Stl => "stl",
-            Self::Obj => "obj",
-            Self::Vtp => "vtp",
-            Self::Vert => "vert",
-            Self::Face => "face",
-            Self::Png => "png",
         }
     }
 
@@ -147,18 +119,11 @@ impl Format {
     }
 }
 
-impl fmt::Display for Format {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(self.name())
-    }
-}
-
 impl FromStr for Format {
     type Err = UnknownFormat;
 
     fn from_str(text: &str) -> Result<Self, Self::Err> {
-        let lower = text.to_ascii_lowercase();
-        Self::ALL.into_iter().find(|f| f.name() == lower).ok_or_else(|| UnknownFormat(text.to_owned()))
+        Self::named(&text.to_ascii_lowercase()).ok_or_else(|| UnknownFormat(text.to_owned()))
     }
 }
 

@@ -127,9 +127,9 @@ impl<'a> Encoder<'a> {
         match &self.plan {
             Plan::Glb(plan) => Some(plan.len()),
             Plan::Gltf(plan) => Some(plan.len()),
-            Plan::Ply(plan) => Some(plan.len()),
-            Plan::Stl(plan) => Some(plan.len()),
-            Plan::Vtp(plan) => Some(plan.len()),
+            Plan::Ply(plan) => Some(plan.len),
+            Plan::Stl(plan) => Some(plan.len),
+            Plan::Vtp(plan) => Some(plan.len),
             Plan::PlyText(_) | Plan::Obj(_) | Plan::Msms(_) => None,
         }
     }
@@ -138,9 +138,9 @@ impl<'a> Encoder<'a> {
     #[must_use]
     pub fn encoded_len_bound(&self) -> u64 {
         match &self.plan {
-            Plan::PlyText(plan) => plan.len_bound(),
-            Plan::Obj(plan) => plan.len_bound(),
-            Plan::Msms(plan) => plan.len_bound(),
+            Plan::PlyText(plan) => plan.len_bound,
+            Plan::Obj(plan) => plan.len_bound,
+            Plan::Msms(plan) => plan.len_bound,
             _ => self.encoded_len().unwrap_or(u64::MAX),
         }
     }

@@ -27,7 +27,8 @@ enum Rows {
 #[derive(Debug)]
 pub(super) struct MsmsPlan {
     header: String,
-    len_bound: u64,
+    /// Upper bound of the file's length, bytes.
+    pub(super) len_bound: u64,
     rows: Rows,
 }
 
@@ -51,11 +52,6 @@ impl MsmsPlan {
         let header = header(rows, n, mesh, meta);
         let len_bound = header.len() as u64 + row * n as u64;
         Self { header, len_bound, rows }
-    }
-
-    /// Returns an upper bound of the file's length, bytes.
-    pub(super) fn len_bound(&self) -> u64 {
-        self.len_bound
     }
 
     /// Writes the file.

@@ -23,7 +23,8 @@ pub(super) struct ObjPlan {
     header: String,
     /// Line that begins the group of each part.
     groups: Vec<String>,
-    len_bound: u64,
+    /// Upper bound of the file's length, bytes.
+    pub(super) len_bound: u64,
     storage: Storage,
 }
 
@@ -44,11 +45,6 @@ impl ObjPlan {
         let of_groups = groups.iter().map(|line| line.len() as u64).sum::<u64>();
         let len_bound = header.len() as u64 + (vertex + normal) * n_vertices + face * n_triangles + of_groups;
         Ok(Self { header, groups, len_bound, storage })
-    }
-
-    /// Returns an upper bound of the file's length, bytes.
-    pub(super) fn len_bound(&self) -> u64 {
-        self.len_bound
     }
 
     /// Writes the file.

@@ -15,7 +15,7 @@ const FACE_BYTES: usize = 13;
 #[derive(Debug)]
 pub(super) struct PlyPlan {
     header: String,
-    len: u64,
+    pub(super) len: u64,
     storage: Storage,
 }
 
@@ -26,10 +26,6 @@ impl PlyPlan {
         let vertex = vertex_bytes(mesh, storage.normals) as u64;
         let len = header.len() as u64 + vertex * n_vertices + FACE_BYTES as u64 * n_triangles;
         Self { header, len, storage }
-    }
-
-    pub(super) fn len(&self) -> u64 {
-        self.len
     }
 
     pub(super) fn write(&self, mesh: &Mesh, out: &mut dyn Write) -> io::Result<()> {

@@ -17,7 +17,8 @@ use super::{Meta, Normals, Storage};
 #[derive(Debug)]
 pub(super) struct PlyTextPlan {
     header: String,
-    len_bound: u64,
+    /// Upper bound of the file's length, bytes.
+    pub(super) len_bound: u64,
     storage: Storage,
 }
 
@@ -36,11 +37,6 @@ impl PlyTextPlan {
         let face = "3\n".len() as u64 + 3 * digits(n_vertices);
         let len_bound = header.len() as u64 + vertex * n_vertices + face * n_triangles;
         Ok(Self { header, len_bound, storage })
-    }
-
-    /// Returns an upper bound of the file's length, bytes.
-    pub(super) fn len_bound(&self) -> u64 {
-        self.len_bound
     }
 
     /// Writes the file.
@@ -123,6 +119,6 @@ mod tests {
         );
         assert_eq!(records, expected);
         // The index in the triangle is invalid and longer than the bound of a valid one.
-        assert!(text.len() as u64 <= plan.len_bound() + 27, "{} of {}", text.len(), plan.len_bound());
+        assert!(text.len() as u64 <= plan.len_bound + 27, "{} of {}", text.len(), plan.len_bound);
     }
 }

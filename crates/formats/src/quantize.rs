@@ -1,6 +1,6 @@
 //! Storage of glTF vertices in 12 bytes instead of 24. [`surface::quantize`](molmesh_surface::quantize) rounds them.
 
-use molmesh_surface::Mesh;
+use molmesh_surface::{Mesh, named};
 
 use super::Format;
 pub use molmesh_surface::quantize::{Step, normal};
@@ -17,20 +17,9 @@ pub enum Compress {
     Meshopt,
 }
 
+named!(Compress, None => "none", Quantize => "quantize", Meshopt => "meshopt");
+
 impl Compress {
-    /// All values.
-    pub const ALL: [Self; 3] = [Self::None, Self::Quantize, Self::Meshopt];
-
-    /// Returns the value of the parameter.
-    #[must_use]
-    pub const fn name(self) -> &'static str {
-        match self {
-            Self::None => "none",
-            Self::Quantize => "quantize",
-            Self::Meshopt => "meshopt",
-        }
-    }
-
     /// Returns true if files of `format` can be stored this way.
     #[must_use]
     pub const fn is_held_by(self, format: Format) -> bool {

@@ -19,7 +19,7 @@ const TRIANGLE_BYTES: usize = 50;
 pub(super) struct StlPlan {
     /// Header and count.
     head: [u8; HEADER_BYTES + 4],
-    len: u64,
+    pub(super) len: u64,
     units: Units,
 }
 
@@ -37,10 +37,6 @@ impl StlPlan {
         head[..words.len()].copy_from_slice(words);
         head[HEADER_BYTES..].copy_from_slice(&count.to_le_bytes());
         Ok(Self { head, len: (HEADER_BYTES + 4) as u64 + TRIANGLE_BYTES as u64 * u64::from(count), units })
-    }
-
-    pub(super) fn len(&self) -> u64 {
-        self.len
     }
 
     pub(super) fn write(&self, mesh: &Mesh, out: &mut dyn Write) -> io::Result<()> {

@@ -1,5 +1,7 @@
 //! Storage options of a file besides its format: packing of vertices, normals, and units of coordinates.
 
+use molmesh_surface::named;
+
 use super::{Format, Packing};
 
 /// Value of the parameter `normals`.
@@ -13,19 +15,7 @@ pub enum Normals {
     None,
 }
 
-impl Normals {
-    /// All values.
-    pub const ALL: [Self; 2] = [Self::Smooth, Self::None];
-
-    /// Returns the value of the parameter.
-    #[must_use]
-    pub const fn name(self) -> &'static str {
-        match self {
-            Self::Smooth => "smooth",
-            Self::None => "none",
-        }
-    }
-}
+named!(Normals, Smooth => "smooth", None => "none");
 
 /// Value of the parameter `units`: length of one unit in a file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
@@ -39,20 +29,9 @@ pub enum Units {
     Meter,
 }
 
+named!(Units, Angstrom => "angstrom", Nanometer => "nanometer", Meter => "meter");
+
 impl Units {
-    /// All units.
-    pub const ALL: [Self; 3] = [Self::Angstrom, Self::Nanometer, Self::Meter];
-
-    /// Returns the value of the parameter, which is also the name in files.
-    #[must_use]
-    pub const fn name(self) -> &'static str {
-        match self {
-            Self::Angstrom => "angstrom",
-            Self::Nanometer => "nanometer",
-            Self::Meter => "meter",
-        }
-    }
-
     /// Length of the unit, Å.
     #[must_use]
     pub const fn length(self) -> f64 {

@@ -19,7 +19,7 @@ const END: &str = "\n  </AppendedData>\n</VTKFile>\n";
 #[derive(Debug)]
 pub(super) struct VtpPlan {
     header: String,
-    len: u64,
+    pub(super) len: u64,
     storage: Storage,
     /// Bytes of the integers of triangles.
     index_bytes: u64,
@@ -59,10 +59,6 @@ impl VtpPlan {
         plan.header = header(mesh, storage, meta, &arrays);
         plan.len = plan.header.len() as u64 + offset + END.len() as u64;
         plan
-    }
-
-    pub(super) fn len(&self) -> u64 {
-        self.len
     }
 
     /// Returns the columns of the file of a mesh.

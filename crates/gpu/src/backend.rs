@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use molmesh_surface::{
-    Backend, BackendIdentity, Control, DeviceStatus, MeshOutput, MeshSink, Spheres, Stage, SurfaceError, SurfaceLimits,
+    Backend, BackendIdentity, BackendJob, Control, DeviceStatus, MeshOutput, Spheres, Stage, SurfaceError, SurfaceLimits,
     SurfaceParams, backend::one_atom,
 };
 
@@ -114,14 +114,8 @@ impl Backend for GpuBackend {
         pool::describe(&up)
     }
 
-    fn write(
-        &self,
-        spheres: &Spheres,
-        params: &SurfaceParams,
-        limits: &SurfaceLimits,
-        control: &Control<'_>,
-        sink: Option<&dyn MeshSink>,
-    ) -> Result<MeshOutput, SurfaceError> {
+    fn write(&self, job: &BackendJob<'_>) -> Result<MeshOutput, SurfaceError> {
+        let BackendJob { spheres, params, limits, control, sink } = *job;
         control.check()?;
         let (metered, memory) = control.with_reservation();
         let job = Self::job(spheres, params, limits, &metered)?;

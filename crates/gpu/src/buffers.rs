@@ -1,9 +1,26 @@
 //! Buffers that the stages bind.
 
-/// Buffer of a job. The build derives the variant from the name of the shader variable: `first_atoms` binds
-/// [`BufferId::FirstAtoms`].
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum BufferId {
+use wgpu::{Buffer, BufferUsages, Device};
+
+macro_rules! buffers {
+    ($($(#[$doc:meta])+ $id:ident,)+) => {
+        /// Buffer of a job. The build derives the variant from the name of the shader variable: `first_atoms` binds
+        /// [`BufferId::FirstAtoms`].
+        #[derive(Debug, Clone, Copy, PartialEq, Eq)]
+        pub enum BufferId {
+            $($(#[$doc])+ $id,)+
+            /// Case table, shared by all jobs.
+            Cases,
+        }
+
+        impl BufferId {
+            /// Buffers of which each job has its own: all except [`Self::Cases`], in the order of the variants.
+            pub(super) const OF_JOB: [Self; Self::Cases.index()] = [$(Self::$id),+];
+        }
+    };
+}
+
+buffers! {
     /// Rows of parameters, one per dispatch.
     Params,
     /// Atoms on the lattice, and bounding spheres of arcs behind them.
@@ -51,51 +68,16 @@ pub enum BufferId {
     Triangles,
     /// Table of the offsets of the blocks of `measure`, and the blocks: one per brick that the surface intersects.
     Sheets,
-    /// Case table, shared by all jobs.
-    Cases,
 }
 
 impl BufferId {
-    /// Buffers of which each job has its own: all except [`Self::Cases`], in the order of the variants.
-    pub(super) const OF_JOB: [Self; 23] = [
-        Self::Params,
-        Self::Atoms,
-        Self::Reaches,
-        Self::Boundary,
-        Self::Tiles,
-        Self::Bricks,
-        Self::FirstAtoms,
-        Self::Halo,
-        Self::Lists,
-        Self::Heads,
-        Self::Field,
-        Self::Crossings,
-        Self::Inside,
-        Self::Records,
-        Self::Counts,
-        Self::Offsets,
-        Self::Groups,
-        Self::Counters,
-        Self::Positions,
-        Self::Normals,
-        Self::Sources,
-        Self::Triangles,
-        Self::Sheets,
-    ];
-
     /// Returns the index of the buffer in [`Self::OF_JOB`], or the length of that array for [`Self::Cases`].
     pub(super) const fn index(self) -> usize {
         self as usize
     }
 }
 
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn buffers_of_a_job_are_listed_by_index() {
-        assert!(BufferId::OF_JOB.iter().enumerate().all(|(i, id)| id.index() == i));
-        assert_eq!(BufferId::Cases.index(), BufferId::OF_JOB.len());
-    }
+/// Creates a buffer.
+pub(super) fn buffer(device: &Device, label: &str, size: u64, usage: BufferUsages) -> Buffer {
+    device.create_buffer(&wgpu::BufferDescriptor { label: Some(label), size, usage, mapped_at_creation: false })
 }

@@ -9,9 +9,9 @@ use std::sync::atomic::{AtomicU64, Ordering};
 
 use molmesh_surface::lattice::{LatticeAtom, to_u32};
 use molmesh_surface::limit::{Exceeded, Limit, slightly_coarser};
-use wgpu::{Buffer, Device, Queue};
+use wgpu::{Buffer, BufferUsages, Device, Queue};
 
-use super::buffers::BufferId;
+use super::buffers::{BufferId, buffer};
 use super::device_errors::DeviceErrors;
 use super::error::GpuError;
 use super::executor::NextJob;
@@ -128,12 +128,8 @@ impl Engine {
         let errors = DeviceErrors::listen(&device);
         let pipelines = Pipelines::new(&device);
         let table = layout::case_table();
-        let cases = device.create_buffer(&wgpu::BufferDescriptor {
-            label: Some("molmesh.Cases"),
-            size: 4 * table.len() as u64,
-            usage: wgpu::BufferUsages::STORAGE | wgpu::BufferUsages::COPY_DST,
-            mapped_at_creation: false,
-        });
+        let usage = BufferUsages::STORAGE | BufferUsages::COPY_DST;
+        let cases = buffer(&device, "molmesh.Cases", 4 * table.len() as u64, usage);
         queue.write_buffer(&cases, 0, bytemuck::cast_slice(&table));
         let engine = Self {
             max_binding: max_binding(&limits),

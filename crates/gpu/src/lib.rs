@@ -7,7 +7,8 @@
 //! A module names only modules of earlier lines:
 //!
 //! ```text
-//! error, buffers, plan, readback, hang_limit, hardware, manifests, choose, picture_targets
+//! error, buffers
+//! plan, readback, hang_limit, hardware, manifests, choose, picture_targets
 //! sheets, shaders, device_errors, discover
 //! job
 //! partition_handle, pipelines, multi_device, picture_passes

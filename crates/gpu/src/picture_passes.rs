@@ -15,11 +15,11 @@ use wgpu::{
     VertexAttribute, VertexBufferLayout, VertexFormat, VertexStepMode,
 };
 
+use super::buffers::buffer;
 use super::device_errors::DeviceErrors;
 use super::error::GpuError;
 use super::picture_targets::{
-    DEPTH, DEPTH_BUFFER, FinishParams, NO_SURFACE_DEPTH, PATTERN, SHADE, ViewUniform, buffer, layer, layered, taps_of,
-    texture,
+    DEPTH, DEPTH_BUFFER, FinishParams, NO_SURFACE_DEPTH, PATTERN, SHADE, ViewUniform, layer, layered, taps_of, texture,
 };
 use super::shaders::{PICTURE, Shader};
 

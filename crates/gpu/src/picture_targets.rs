@@ -7,8 +7,8 @@ use molmesh_picture::finish::{self, Finish};
 use molmesh_picture::light::{AMBIENT, DIFFUSE, LIGHT};
 use molmesh_surface::Mesh;
 use wgpu::{
-    Buffer, BufferUsages, Device, Extent3d, Limits, Texture, TextureDescriptor, TextureDimension, TextureFormat,
-    TextureUsages, TextureView, TextureViewDescriptor, TextureViewDimension,
+    Device, Extent3d, Limits, Texture, TextureDescriptor, TextureDimension, TextureFormat, TextureUsages, TextureView,
+    TextureViewDescriptor, TextureViewDimension,
 };
 
 /// Positions of the samples within a pixel, as in the CPU renderer.
@@ -190,9 +190,4 @@ pub(super) fn texture(
         usage,
         view_formats: &[],
     })
-}
-
-/// Creates a buffer.
-pub(super) fn buffer(device: &Device, label: &str, size: u64, usage: BufferUsages) -> Buffer {
-    device.create_buffer(&wgpu::BufferDescriptor { label: Some(label), size, usage, mapped_at_creation: false })
 }

@@ -10,16 +10,10 @@ use super::shaders::{Binding, SHADERS, SPHERE_SHADERS, Shader};
 /// Number of stages that run on a device.
 pub(super) const N_STAGES: usize = 8;
 /// Stages that run on a device, in order.
-pub(super) const STAGES: [Stage; N_STAGES] = [
-    Stage::Bin,
-    Stage::Field,
-    Stage::Classify,
-    Stage::Scan,
-    Stage::Refine,
-    Stage::Interpolate,
-    Stage::Emit,
-    Stage::Measure,
-];
+pub(super) const STAGES: [Stage; N_STAGES] = {
+    let [stages @ .., _write, _improve] = Stage::ALL;
+    stages
+};
 /// Stages that have a second shader for surfaces of spheres, in order.
 const SPHERE_STAGES: [Stage; 3] = [Stage::Field, Stage::Refine, Stage::Interpolate];
 

@@ -7,6 +7,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use wgpu::{Buffer, BufferUsages, BufferView, Device};
 
+use super::buffers::buffer;
 use super::error::GpuError;
 
 /// Pool of idle readback buffers.
@@ -34,12 +35,7 @@ pub(super) struct ReadbackBuffer {
 impl Idle {
     fn create(&mut self, device: &Device, size: u64) -> Buffer {
         self.held += size;
-        device.create_buffer(&wgpu::BufferDescriptor {
-            label: Some("molmesh.readback"),
-            size,
-            usage: BufferUsages::MAP_READ | BufferUsages::COPY_DST,
-            mapped_at_creation: false,
-        })
+        buffer(device, "molmesh.readback", size, BufferUsages::MAP_READ | BufferUsages::COPY_DST)
     }
 
     /// Frees the longest idle buffers until the others are at most `limit` bytes.

@@ -3,9 +3,9 @@
 use std::ops::Range;
 
 use molmesh_surface::Stage;
-use wgpu::{Buffer, CommandEncoder, Device, QuerySet, Queue};
+use wgpu::{Buffer, BufferUsages, CommandEncoder, Device, QuerySet, Queue};
 
-use super::buffers::BufferId;
+use super::buffers::{BufferId, buffer};
 use super::output_layout::{COUNTERS_OFFSET, OutputRows, ReadbackLayout, TRIANGLE_BYTES, VertexBytes};
 use super::pipelines::{N_STAGES, Pipelines, TIMESTAMP_BYTES, Variant, stage_index};
 use super::plan::layout::{Counters, GROUP, Params};
@@ -38,18 +38,14 @@ pub(super) struct StageTimer {
 impl StageTimer {
     /// Creates the queries. `None` if the device has no timestamps.
     pub(super) fn new(device: &Device, queue: &Queue) -> Option<Self> {
+        let usage = BufferUsages::QUERY_RESOLVE | BufferUsages::COPY_SRC;
         device.features().contains(wgpu::Features::TIMESTAMP_QUERY).then(|| Self {
             queries: device.create_query_set(&wgpu::QuerySetDescriptor {
                 label: Some("molmesh.timestamps"),
                 ty: wgpu::QueryType::Timestamp,
                 count: 2 * query_number(N_STAGES),
             }),
-            resolved: device.create_buffer(&wgpu::BufferDescriptor {
-                label: Some("molmesh.timestamps"),
-                size: TIMESTAMP_BYTES,
-                usage: wgpu::BufferUsages::QUERY_RESOLVE | wgpu::BufferUsages::COPY_SRC,
-                mapped_at_creation: false,
-            }),
+            resolved: buffer(device, "molmesh.timestamps", TIMESTAMP_BYTES, usage),
             period: f64::from(queue.get_timestamp_period()),
         })
     }

@@ -15,11 +15,13 @@ use super::queued_job::QueuedJob;
 /// Batch that a device runs, or build of its executor.
 pub(super) struct RunningBatch {
     is_build: bool,
-    is_retry: bool,
+    /// True if a job of the batch has failed before.
+    pub(super) is_retry: bool,
     replies: Vec<SyncSender<JobResult>>,
     /// Partition, if the batch consists of one.
     partition: Option<PartitionHandle>,
-    bricks: u64,
+    /// Number of bricks of all jobs.
+    pub(super) bricks: u64,
     /// Submissions of the executor.
     submissions: Arc<AtomicU64>,
     /// Number of submissions, and the time at which it was first seen.
@@ -42,19 +44,9 @@ impl RunningBatch {
         Self { is_build: true, ..Self::new(&[], Arc::default(), now) }
     }
 
-    /// Returns true if a job of the batch has failed before.
-    pub(super) const fn is_retry(&self) -> bool {
-        self.is_retry
-    }
-
     /// Number of jobs.
     pub(super) fn len(&self) -> usize {
         self.replies.len()
-    }
-
-    /// Number of bricks of all jobs.
-    pub(super) const fn bricks(&self) -> u64 {
-        self.bricks
     }
 
     /// Returns the time limit of a submission, or of the build. For `minimum` and `fastest`, see

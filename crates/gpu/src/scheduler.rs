@@ -253,7 +253,7 @@ impl Scheduler {
         let mut state = self.lock();
         let queue = state.queue_of(thread)?;
         let next = queue.waiting.front().filter(|next| next.is_alone())?;
-        let runs_retry = queue.running.as_ref().is_none_or(RunningBatch::is_retry);
+        let runs_retry = queue.running.as_ref().is_none_or(|running| running.is_retry);
         (!runs_retry).then(|| next.job.clone())
     }
 
@@ -305,7 +305,7 @@ impl Scheduler {
                 queue.consecutive_rebuilds = 0;
                 queue.cool_down = self.settings.cool_down;
             }
-            let bricks = queue.running.take().map_or(0, |running| running.bricks());
+            let bricks = queue.running.take().map_or(0, |running| running.bricks);
             if bricks > 0 && results.iter().all(Result::is_ok) {
                 let per_brick = time.as_secs_f64() / bricks as f64;
                 queue.fastest = Some(queue.fastest.map_or(per_brick, |fastest| fastest.min(per_brick)));

@@ -4,7 +4,7 @@ use molmesh_surface::Stage;
 use molmesh_surface::lattice::LatticeAtom;
 use wgpu::{BindGroup, Buffer, BufferUsages, Device};
 
-use super::buffers::BufferId;
+use super::buffers::{BufferId, buffer};
 use super::output_layout::{OutputRows, TRIANGLE_BYTES, VertexBytes};
 use super::pipelines::{Pipelines, ShaderIndex, Variant};
 use super::plan::layout::{BRICK_POINTS, BrickRecord, CROSSING_BYTES, Counters, Params, Tile};
@@ -155,10 +155,5 @@ impl Workspace {
 
 fn create_buffer(device: &Device, id: BufferId, size: u64) -> Buffer {
     let usage = if id == BufferId::Params { BufferUsages::UNIFORM } else { BufferUsages::STORAGE };
-    device.create_buffer(&wgpu::BufferDescriptor {
-        label: Some(&format!("molmesh.{id:?}")),
-        size,
-        usage: usage | BufferUsages::COPY_DST | BufferUsages::COPY_SRC,
-        mapped_at_creation: false,
-    })
+    buffer(device, &format!("molmesh.{id:?}"), size, usage | BufferUsages::COPY_DST | BufferUsages::COPY_SRC)
 }

@@ -3,7 +3,7 @@
 use std::fmt;
 use std::str::FromStr;
 
-use molmesh_surface::{Exceeded, Limit};
+use molmesh_surface::{Exceeded, Limit, named};
 
 use super::PictureError;
 
@@ -34,25 +34,8 @@ pub enum View {
     Bottom,
 }
 
-impl View {
-    /// All views.
-    pub const ALL: [Self; 7] =
-        [Self::Principal, Self::Front, Self::Back, Self::Left, Self::Right, Self::Top, Self::Bottom];
-
-    /// Name.
-    #[must_use]
-    pub const fn name(self) -> &'static str {
-        match self {
-            Self::Principal => "principal",
-            Self::Front => "front",
-            Self::Back => "back",
-            Self::Left => "left",
-            Self::Right => "right",
-            Self::Top => "top",
-            Self::Bottom => "bottom",
-        }
-    }
-}
+named!(View, Principal => "principal", Front => "front", Back => "back", Left => "left", Right => "right",
+    Top => "top", Bottom => "bottom");
 
 /// Style of shading.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -64,19 +47,7 @@ pub enum Style {
     Gouraud,
 }
 
-impl Style {
-    /// All styles.
-    pub const ALL: [Self; 2] = [Self::Surface, Self::Gouraud];
-
-    /// Name.
-    #[must_use]
-    pub const fn name(self) -> &'static str {
-        match self {
-            Self::Surface => "surface",
-            Self::Gouraud => "gouraud",
-        }
-    }
-}
+named!(Style, Surface => "surface", Gouraud => "gouraud");
 
 /// Colour of the background: red, green, blue (sRGB) and alpha, not premultiplied.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]

@@ -211,9 +211,7 @@ pub(super) fn fill(
         let signed = |n: [usize; 2]| n.map(|n| i64::try_from(n).unwrap_or(i64::MAX));
         let (corner, size) = (signed([left, band.top]), signed([width, height]));
         for (n, triangle) in triangles.enumerate() {
-            if n % TRIANGLES_PER_CHECK == 0 {
-                control.check()?;
-            }
+            control.check_every(n, TRIANGLES_PER_CHECK)?;
             Facet::new(mesh, triangle, camera).draw(mesh, camera, corner, size, samples);
         }
         for y in 0..height {

@@ -6,6 +6,7 @@ use std::fmt;
 use std::str::FromStr;
 
 use molmesh_structure::{ReadLimits, Selected, Structure, select};
+use molmesh_surface::params::bad;
 use molmesh_surface::{
     AreaParts, Control, ExactMeasures, Reservation, Spheres, SurfaceError, SurfaceKind, SurfaceLimits,
 };
@@ -184,7 +185,7 @@ pub fn measure_selection(
         let (report, areas) = whole(structure, &selected, &spheres, options, surface, control)?;
         (SelectionMeasures::Exact(report), areas)
     };
-    Ok(MeasuredSelection { left_out: LeftOutReport::new(&selected.left_out), measures, areas })
+    Ok(MeasuredSelection { left_out: selected.left_out, measures, areas })
 }
 
 /// Measures `spheres`, those of the `selected` atoms.
@@ -251,9 +252,7 @@ impl Interface {
         let mut is_meshed = vec![false; sides[0].len()];
         let mut rows = [Vec::new(), Vec::new()];
         for (row, &atom) in (0_u32..).zip(&selected.atoms) {
-            if (row as usize).is_multiple_of(ATOMS_PER_CHECK) {
-                control.check()?;
-            }
+            control.check_every(row as usize, ATOMS_PER_CHECK)?;
             let chain = structure.chain.id(atom as usize) as usize;
             is_meshed[chain] = true;
             for (rows, side) in rows.iter_mut().zip(&sides) {
@@ -265,10 +264,7 @@ impl Interface {
         let mut absent = structure.chain.texts().enumerate().filter(|(chain, _)| !is_meshed[*chain]);
         match absent.find(|(chain, _)| sides.iter().any(|side| side[*chain])) {
             None => Ok(rows),
-            Some((_, name)) => {
-                let expected = "names of chains that are meshed".to_owned();
-                Err(SurfaceError::BadParameter { name: "interface", value: format!("`{name}`"), expected }.into())
-            }
+            Some((_, name)) => Err(bad("interface", format!("`{name}`"), "names of chains that are meshed").into()),
         }
     }
 

@@ -2,10 +2,7 @@
 
 use std::sync::OnceLock;
 
-use molmesh_surface::{
-    Backend, BackendIdentity, Control, DeviceStatus, MeshOutput, MeshSink, Spheres, SurfaceError, SurfaceLimits,
-    SurfaceParams,
-};
+use molmesh_surface::{Backend, BackendIdentity, BackendJob, DeviceStatus, MeshOutput, SurfaceError};
 
 /// Backend that owns a CPU and a GPU backend.
 pub struct AutoBackend {
@@ -51,15 +48,8 @@ impl Backend for AutoBackend {
         self.gpu.describe()
     }
 
-    fn write(
-        &self,
-        spheres: &Spheres,
-        params: &SurfaceParams,
-        limits: &SurfaceLimits,
-        control: &Control<'_>,
-        sink: Option<&dyn MeshSink>,
-    ) -> Result<MeshOutput, SurfaceError> {
-        FallbackBackend::new(self).write(spheres, params, limits, control, sink)
+    fn write(&self, job: &BackendJob<'_>) -> Result<MeshOutput, SurfaceError> {
+        FallbackBackend::new(self).write(job)
     }
 
     fn for_job(&self) -> Option<Box<dyn Backend + '_>> {
@@ -119,21 +109,14 @@ impl Backend for FallbackBackend<'_> {
         self.backend().describe()
     }
 
-    fn write(
-        &self,
-        spheres: &Spheres,
-        params: &SurfaceParams,
-        limits: &SurfaceLimits,
-        control: &Control<'_>,
-        sink: Option<&dyn MeshSink>,
-    ) -> Result<MeshOutput, SurfaceError> {
+    fn write(&self, job: &BackendJob<'_>) -> Result<MeshOutput, SurfaceError> {
         if self.failure.get().is_none() {
-            match self.auto.gpu.write(spheres, params, limits, control, sink) {
+            match self.auto.gpu.write(job) {
                 Err(SurfaceError::Device { why }) => drop(self.failure.set(why)),
                 written => return written,
             }
         }
-        let output = self.auto.cpu.write(spheres, params, limits, control, sink)?;
+        let output = self.auto.cpu.write(job)?;
         let fallback_reason = self.failure.get().map(|why| format!("the GPU failed: {why}"));
         let made_by = Some(BackendIdentity { fallback_reason, ..self.auto.cpu.identity() });
         Ok(MeshOutput { made_by, ..output })

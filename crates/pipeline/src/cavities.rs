@@ -2,7 +2,9 @@
 
 use molmesh_structure::{Selected, Structure};
 use molmesh_surface::cavities::{InnerComponents, find};
-use molmesh_surface::{Cavity, Column, Control, MeshOutput, Spheres, SurfaceError, SurfaceLimits, SurfaceParams};
+use molmesh_surface::{
+    Cavity, Column, Control, MeshOutput, Spheres, SurfaceError, SurfaceLimits, SurfaceParams, named,
+};
 use rustc_hash::FxHashSet;
 use serde::Serialize;
 
@@ -19,20 +21,7 @@ pub enum Cavities {
     Only,
 }
 
-impl Cavities {
-    /// All values.
-    pub const ALL: [Self; 3] = [Self::Keep, Self::Drop, Self::Only];
-
-    /// Returns the value of the parameter.
-    #[must_use]
-    pub const fn name(self) -> &'static str {
-        match self {
-            Self::Keep => "keep",
-            Self::Drop => "drop",
-            Self::Only => "only",
-        }
-    }
-}
+named!(Cavities, Keep => "keep", Drop => "drop", Only => "only");
 
 /// Residue that lines a cavity or a pocket.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, utoipa::ToSchema)]

@@ -25,7 +25,7 @@ use molmesh_surface::triangle::{Corners, centroid};
 use molmesh_surface::{Component, Control, Mesh, PartRange, SurfaceError};
 use rayon::prelude::*;
 
-pub use self::deviation::Deviation;
+pub use self::deviation::SimplificationReport;
 use self::piece::{CubePiece, CubeResult};
 
 /// Smallest and largest value of the parameter `simplify`, Å.
@@ -51,15 +51,6 @@ pub struct Simplify {
     pub error: f64,
     /// Number of triangles at which the simplification ends; `None` to remove as many as the error permits.
     pub max_triangles: Option<u64>,
-}
-
-/// Result of a simplification.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Simplification {
-    /// Number of triangles before the simplification.
-    pub triangles: u64,
-    /// Distance between the original and the simplified surface.
-    pub deviation: Deviation,
 }
 
 /// Edge length of the cubes, Å.
@@ -110,7 +101,7 @@ pub(crate) fn simplify(
     wanted: Simplify,
     spacing: f64,
     control: &Control<'_>,
-) -> Result<Simplification, SurfaceError> {
+) -> Result<SimplificationReport, SurfaceError> {
     let Simplify { error, max_triangles } = wanted;
     check_error(error, spacing)?;
     mesh.make_contiguous();
@@ -167,11 +158,10 @@ pub(crate) fn simplify(
     }
     let parts = part_ranges(mesh);
     let after = Triangles { positions: &positions, rows: &mesh.triangles, parts: &parts };
-    let deviation = Deviation::sampled(before, after, error * f64::from(n_passes), side, control)?;
-    let triangles = rows.len() as u64;
+    let report = SimplificationReport::sampled(before, after, error * f64::from(n_passes), side, control)?;
     drop((rows, positions, memory));
     compact(mesh, control)?;
-    Ok(Simplification { triangles, deviation })
+    Ok(report)
 }
 
 /// Returns the range of triangles of each part; empty for a mesh without parts.

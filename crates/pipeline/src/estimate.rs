@@ -10,7 +10,7 @@ use molmesh_formats::Compress;
 use molmesh_structure::{Structure, StructureError};
 use molmesh_surface::cpu::{LATTICE_BYTES, check_work, scan};
 use molmesh_surface::lattice::Lattice;
-use molmesh_surface::params::MAX_RESOLUTION;
+use molmesh_surface::params::{MAX_RESOLUTION, bad};
 use molmesh_surface::{
     Control, Limit, OutOfMemory, Reservation, SurfaceError, SurfaceParams, TriangleQuality, candidates, improve,
 };
@@ -77,8 +77,7 @@ pub fn estimate<S: Deref<Target = Structure>>(
     control: &Control<'_>,
 ) -> Result<Estimate, JobError> {
     if let Some(tile) = options.tile {
-        let (value, expected) = (format!("`{}`", tile.path()), "no value in an estimate".to_owned());
-        return Err(SurfaceError::BadParameter { name: "tile", value, expected }.into());
+        return Err(bad("tile", format!("`{}`", tile.path()), "no value in an estimate").into());
     }
     let clock = StageClock::new(&());
     let scope = WorkScope::new(&clock, control);
@@ -106,7 +105,7 @@ pub fn estimate<S: Deref<Target = Structure>>(
     };
     let params = options.mesh_params(&spheres, spacing);
     let plan = MeshPlan { meshing: &meshing, params: &params, compress: options.compress };
-    let lattices = plan.lattices(control)?;
+    let (lattices, memory) = plan.lattices(control)?;
     let box_cells = lattices.iter().fold(0, |all: u64, lattice| all.saturating_add(lattice.box_cells));
     let resolution = params.resolution;
     let simplifies = options.simplify.map_or(Ok(()), |wanted| check_error(wanted.error, params.resolution));
@@ -114,7 +113,7 @@ pub fn estimate<S: Deref<Target = Structure>>(
     // In the order of the job, the search for pockets comes first.
     let checked = pocket_rows.clone().map(drop).and(simplifies).and(fitted.map(drop));
     let mesh = checked.and_then(|()| plan.mesh(&lattices, control));
-    drop(lattices);
+    drop((lattices, memory));
     let mesh = mesh.and_then(|mesh| {
         let mesh = max_triangles.map_or(mesh, |limit| mesh.at_most(limit, &params));
         let with_attributes = |mesh: &MeshEstimate| mesh.bytes + options.attribute_bytes() * mesh.vertices;
@@ -176,7 +175,7 @@ pub(super) fn check_memory(plan: &MeshPlan<'_>, options: &Options, control: &Con
     if memory.check(most).is_ok() {
         return Ok(());
     }
-    let mesh = plan.mesh(&plan.lattices(control)?, control)?;
+    let mesh = plan.mesh(&plan.lattices(control)?.0, control)?;
     let bytes = mesh.bytes.saturating_add(attributes(mesh.vertices));
     Ok(memory.check(bytes.saturating_add(plan.bytes_before_cut(&mesh)))?)
 }
@@ -208,20 +207,6 @@ pub(super) struct MeshPlan<'a> {
     pub(super) compress: Compress,
 }
 
-/// Lattices of all parts, and their memory.
-struct Lattices {
-    of_parts: Vec<Lattice>,
-    _memory: Reservation,
-}
-
-impl Deref for Lattices {
-    type Target = [Lattice];
-
-    fn deref(&self) -> &[Lattice] {
-        &self.of_parts
-    }
-}
-
 impl MeshPlan<'_> {
     /// Returns the memory of a compressed mesh, which is held besides the mesh, bytes.
     fn compressed_bytes(&self, vertices: u64) -> u64 {
@@ -235,13 +220,13 @@ impl MeshPlan<'_> {
         if self.meshing.cut.is_some() { bytes } else { 0 }
     }
 
-    /// Places the spheres of each part on its lattice.
-    fn lattices(&self, control: &Control<'_>) -> Result<Lattices, SurfaceError> {
+    /// Places the spheres of each part on its lattice. Returns the memory of the lattices as well.
+    fn lattices(&self, control: &Control<'_>) -> Result<(Vec<Lattice>, Reservation), SurfaceError> {
         // All lattices, and the spheres of one part at a time.
         let Meshing { spheres, parts, .. } = *self.meshing;
         let memory = control.reserve((LATTICE_BYTES + super::SPHERE_BYTES) * spheres.len() as u64)?;
         let lattices = parts::spheres_of(spheres, parts).map(|own| Lattice::new(&own, self.params, control));
-        Ok(Lattices { of_parts: lattices.collect::<Result<_, SurfaceError>>()?, _memory: memory })
+        Ok((lattices.collect::<Result<_, _>>()?, memory))
     }
 
     /// Estimates the mesh.
@@ -291,7 +276,7 @@ impl MeshPlan<'_> {
         if error.exceeded(Limit::MeshBytes).is_none() {
             return error;
         }
-        match self.lattices(control).and_then(|lattices| self.mesh(&lattices, control)) {
+        match self.lattices(control).and_then(|(lattices, _memory)| self.mesh(&lattices, control)) {
             Err(planned) if ends_work(&planned) || planned.exceeded(Limit::MeshBytes).is_some() => planned,
             _ => error,
         }

@@ -16,7 +16,6 @@ mod file;
 mod fit;
 mod instances;
 pub mod integer;
-mod left_out;
 mod limits;
 mod load;
 mod map_file;
@@ -41,7 +40,7 @@ pub use areas::{AreaLevel, ExactReport, Interface, InterfaceReport, MeasuredSele
 pub use auto::AutoBackend;
 pub use cavities::{Cavities, CavityReport, LiningResidue};
 pub use clock::{ProgressSink, StageClock, WorkScope};
-pub use collapse::{Deviation, SIMPLIFY_ERRORS, Simplification, Simplify};
+pub use collapse::{SIMPLIFY_ERRORS, SimplificationReport, Simplify};
 pub use color::{AtomColors, ColorError, ColorReport, Coloring, MapReport};
 pub use components::{ComponentReport, VoidReport};
 pub use draw::draw;
@@ -49,15 +48,14 @@ pub use error::JobError;
 pub use estimate::{Estimate, MeshEstimate, estimate};
 pub use file::{File, Product};
 pub use instances::{AssemblyReport, InstancesReport};
-pub use left_out::{KindCount, LeftOutReport, ResidueCount};
 pub use limits::JobLimits;
 pub use map_file::MapFile;
+pub use molmesh_structure::{KindCount, LeftOut as LeftOutReport, ResidueCount};
 pub use parts::PartReport;
 pub use pockets::PocketReport;
 pub use progress::Tracker;
 pub use report::{PictureReport, Quantization, Report, file_arithmetic};
 pub use shapes::TriangleReport;
-pub use simplify::SimplificationReport;
 pub use spacing::Spacing;
 pub use work::{BYTES_PER_ATOM, estimate_atoms, estimate_work, suits_gpu};
 
@@ -71,7 +69,7 @@ use molmesh_formats::{Compress, GlbSink, Normals, Packing, Step, Storage, Units}
 use molmesh_picture::{PictureParams, SelectedRenderer};
 use molmesh_structure::{AtomPart, Context, Selection, Split, Structure, StructureError};
 use molmesh_surface::{
-    Backend, Control, FoundDevice, MeshOutput, Pockets, SinkFailed, Spheres, SurfaceError, SurfaceParams,
+    Backend, BackendJob, Control, FoundDevice, MeshOutput, Pockets, SinkFailed, Spheres, SurfaceError, SurfaceParams,
     TriangleQuality, Validation, lattice,
 };
 use report::Counts;
@@ -382,7 +380,8 @@ fn mesh(
     let written = if let Some(sink) = sink {
         sink.set_storage(options.storage(params.quantize));
         let Meshing { backend, spheres, limits, .. } = *meshing;
-        clock.pass(|| backend.write(spheres, &params, limits, control, Some(sink)))
+        let job = BackendJob { spheres, params: &params, limits, control, sink: Some(sink) };
+        clock.pass(|| backend.write(&job))
     } else {
         let before_simplifying = simplify::params_of_input(options, &params)?;
         estimate::check_memory(&plan, options, control)?;

@@ -6,7 +6,7 @@ use molmesh_structure::map::MapLimits;
 use molmesh_surface::SurfaceLimits;
 
 /// Limits of one job.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone, Copy, Default)]
 pub struct JobLimits {
     /// Limits of reading.
     pub read: ReadLimits,
@@ -16,11 +16,4 @@ pub struct JobLimits {
     pub picture: PictureLimits,
     /// Limits of reading a map.
     pub map: MapLimits,
-}
-
-impl Default for JobLimits {
-    fn default() -> Self {
-        let (read, surface, picture) = <(ReadLimits, SurfaceLimits, PictureLimits)>::default();
-        Self { read, surface, picture, map: MapLimits::default() }
-    }
 }

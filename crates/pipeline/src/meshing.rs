@@ -92,7 +92,7 @@ impl Meshing<'_> {
 mod tests {
     use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
 
-    use molmesh_surface::{CpuBackend, MeshSink};
+    use molmesh_surface::{BackendJob, CpuBackend};
 
     use super::*;
     use crate::{AutoBackend, Choice, JobLimits, params, run};
@@ -109,17 +109,10 @@ mod tests {
             String::new()
         }
 
-        fn write(
-            &self,
-            spheres: &Spheres,
-            params: &SurfaceParams,
-            limits: &SurfaceLimits,
-            control: &Control<'_>,
-            sink: Option<&dyn MeshSink>,
-        ) -> Result<MeshOutput, SurfaceError> {
+        fn write(&self, job: &BackendJob<'_>) -> Result<MeshOutput, SurfaceError> {
             let left = self.0.fetch_update(Relaxed, Relaxed, |left| left.checked_sub(1));
             left.map_err(|_none| SurfaceError::Device { why: "lost".into() })?;
-            CpuBackend::default().write(spheres, params, limits, control, sink)
+            CpuBackend::default().write(job)
         }
     }
 

@@ -5,7 +5,6 @@
 
 pub mod areas;
 mod canonical;
-mod choices;
 mod domain;
 mod table;
 mod values;
@@ -250,7 +249,7 @@ fn check_pockets(options: &Options) -> Result<(), ParamError> {
 /// Returns the parameter that divides or repeats the surface, with its value.
 fn divided_by(split: Split, Selection { context, instances, .. }: &Selection) -> Option<String> {
     match (split, context) {
-        (split, _) if split != Split::None => Some(split.parameter().to_owned()),
+        (split, _) if split != Split::None => Some(split.parameter()),
         (_, Context::Whole) => Some(format!("context={}", context.name())),
         _ => instances.then(|| "instances=true".to_owned()),
     }

@@ -11,12 +11,10 @@ use super::cavities::CavityReport;
 use super::color::ColorReport;
 use super::components::{ComponentReport, VoidReport};
 use super::instances::{AssemblyReport, InstancesReport};
-use super::left_out::LeftOutReport;
 use super::parts::PartReport;
 use super::pockets::PocketReport;
 use super::shapes::TriangleReport;
-use super::simplify::SimplificationReport;
-use super::{Choice, Options, StageClock};
+use super::{Choice, LeftOutReport, Options, SimplificationReport, StageClock};
 
 /// Quantization of the vertices in the file.
 #[derive(Debug, Clone, Copy, Serialize, utoipa::ToSchema)]
@@ -60,7 +58,7 @@ pub struct PictureReport {
 
 /// Report of a job: input, grid, mesh, measures and times.
 #[expect(clippy::struct_field_names, reason = "the fields are named like the members of the JSON")]
-#[derive(Debug, Clone, Serialize, utoipa::ToSchema)]
+#[derive(Debug, Clone, Default, Serialize, utoipa::ToSchema)]
 pub struct Report {
     /// PDB id or data block name; null if the file has none.
     #[schema(required)]
@@ -271,10 +269,8 @@ impl Report {
             selected_atoms: selected.marks.is_some().then(|| selected.n_selected()),
             atoms_in_file: structure.n_in_file(),
             model: selected.model,
-            models: None,
             assembly: AssemblyReport::new(&options.selection, selected),
-            instances: None,
-            left_out: LeftOutReport::new(&selected.left_out),
+            left_out: selected.left_out.clone(),
             warnings: structure.warnings.clone(),
             radii: structure.radii_name(),
             surface: params.surface.name(),
@@ -307,33 +303,24 @@ impl Report {
             components: components.len() as u64,
             voids: voids.len() as u64,
             void_list: voids.iter().take(100).map(|void| VoidReport::new(void, counts.centre)).collect(),
-            cavities: None,
-            cavity_list: None,
-            pockets: None,
-            pocket_list: None,
-            triangle_shapes: None,
-            simplification: None,
             component_list: components.iter().take(100).map(|c| ComponentReport::new(c, is_open)).collect(),
-            parts: Vec::new(),
             area: measures.area,
             area_deficit_percent: area_deficit_percent(structure, options, counts),
             volume: (!is_open).then_some(measures.volume),
-            exact: None,
             report_units: Units::Angstrom.name(),
             file_units: counts.storage.units.name(),
             normals: counts.storage.normals.name(),
             quantization: counts.storage.packing.step().map(|step| Quantization { step: step.length() }),
-            color: None,
             backend_reason: made_by.reason(choice.reason),
             backend: made_by.backend,
             arithmetic: made_by.arithmetic,
             device: made_by.device,
             fallback: made_by.fallback_reason,
-            picture: None,
             timings_ms: timings
                 .into_iter()
                 .map(|(name, ms)| (name.to_owned(), Value::from((ms * 1e3).round() / 1e3)))
                 .collect(),
+            ..Self::default()
         }
     }
 

@@ -83,9 +83,7 @@ fn to_atom_indices(
         mesh.atom_ids = None;
     }
     for (n, id) in mesh.atom_ids.iter_mut().flat_map(|ids| ids.iter_mut()).enumerate() {
-        if n.is_multiple_of(IDS_PER_CHECK) {
-            control.check()?;
-        }
+        control.check_every(n, IDS_PER_CHECK)?;
         *id = selected.atoms[*id as usize];
     }
     Ok(())

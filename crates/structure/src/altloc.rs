@@ -109,9 +109,7 @@ fn residues(
     let mut latest: HashMap<ResidueKey, usize> = HashMap::new();
     let (mut first, mut before) = (0, None);
     for i in 1..=s.len() {
-        if i % ATOMS_PER_CHECK == 0 {
-            read::check(control)?;
-        }
+        read::check_every(control, i, ATOMS_PER_CHECK)?;
         if i < s.len() && !s.starts_residue[i] {
             continue;
         }

@@ -2,6 +2,8 @@
 
 use std::fmt;
 
+use molmesh_surface::named;
+
 use super::atoms::Structure;
 use super::kind_set::KindSet;
 use super::text::list;
@@ -30,23 +32,8 @@ pub enum Kind {
     VirtualSite,
 }
 
-impl Kind {
-    /// Returns the name: `protein`, `nucleic`, `polymer`, `cofactor`, `glycan`, `ligand`, `ion`, `water` or `virtual`.
-    #[must_use]
-    pub const fn name(self) -> &'static str {
-        match self {
-            Self::Protein => "protein",
-            Self::Nucleic => "nucleic",
-            Self::Polymer => "polymer",
-            Self::Cofactor => "cofactor",
-            Self::Glycan => "glycan",
-            Self::Ion => "ion",
-            Self::Ligand => "ligand",
-            Self::Water => "water",
-            Self::VirtualSite => "virtual",
-        }
-    }
-}
+named!(Kind, Protein => "protein", Nucleic => "nucleic", Polymer => "polymer", Cofactor => "cofactor",
+    Glycan => "glycan", Ligand => "ligand", Ion => "ion", Water => "water", VirtualSite => "virtual");
 
 /// Numbers of atoms by kind. Hydrogens are counted apart from the heavy atoms of their residues.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, serde::Serialize, utoipa::ToSchema)]

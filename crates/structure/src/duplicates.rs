@@ -87,9 +87,7 @@ fn most_crowded(
     let mut has_crowded = false;
     let is_crowded = |count: u16| u64::from(count) > threshold || count == u16::MAX;
     for i in 0..n {
-        if i % ROWS_PER_CHECK == 0 {
-            reading.check()?;
-        }
+        reading.check_every(i, ROWS_PER_CHECK)?;
         let count = &mut counts[bucket(i)];
         *count = count.saturating_add(1);
         has_crowded |= is_crowded(*count);
@@ -102,9 +100,7 @@ fn most_crowded(
     let _of_positions = reading.reserve(BYTES_PER_POSITION * n_crowded as u64)?;
     let mut positions: FxHashMap<AtomPosition, Crowded> = FxHashMap::default();
     for i in 0..n {
-        if i % ROWS_PER_CHECK == 0 {
-            reading.check()?;
-        }
+        reading.check_every(i, ROWS_PER_CHECK)?;
         if !is_crowded(counts[bucket(i)]) {
             continue;
         }

@@ -90,31 +90,15 @@ pub(super) fn pdbqt_type(name: &[u8]) -> u8 {
     }
 }
 
+/// Names of beads in residues.
+const BEADS: &[&str] = &[
+    "BB", "BB1", "BB2", "BB3", "BAS", "SC1", "SC2", "SC3", "SC4", "SC5", "SC6", "NC3", "GL0", "GL1", "GL2", "GL3",
+    "GL4", "AM1", "AM2", "ROH", "W",
+];
+
 /// Returns true for the names of beads that identify a coarse-grained residue (Martini).
 pub(super) fn is_bead(name: &str) -> bool {
-    matches!(
-        name,
-        "BB" | "BB1"
-            | "BB2"
-            | "BB3"
-            | "BAS"
-            | "SC1"
-            | "SC2"
-            | "SC3"
-            | "SC4"
-            | "SC5"
-            | "SC6"
-            | "NC3"
-            | "GL0"
-            | "GL1"
-            | "GL2"
-            | "GL3"
-            | "GL4"
-            | "AM1"
-            | "AM2"
-            | "ROH"
-            | "W"
-    )
+    BEADS.contains(&name)
 }
 
 /// Returns true for metals and halogens, by atomic number.

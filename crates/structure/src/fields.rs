@@ -143,12 +143,12 @@ impl<'a> Rows<'a> {
 
     /// Returns the columns of the atoms.
     pub(super) fn columns_mut(&mut self) -> &mut Columns {
-        self.columns.columns_mut()
+        &mut self.columns.columns
     }
 
     /// Returns the number of atoms.
     pub(super) fn len(&self) -> usize {
-        self.columns.columns().len()
+        self.columns.columns.len()
     }
 
     /// Counts a line, and fails if the caller cancelled.

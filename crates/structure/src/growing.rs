@@ -12,7 +12,7 @@ const CHUNK: usize = 1 << 16;
 /// Columns with reserved memory for some more rows.
 #[derive(Debug, Default)]
 pub(super) struct GrowingColumns {
-    columns: Columns,
+    pub(super) columns: Columns,
     /// Number of rows at which the next check is due.
     next_check: usize,
     /// Number of rows at which the next search for atoms at the same position is due.
@@ -25,18 +25,6 @@ impl GrowingColumns {
     /// Takes columns with rows. The caller has reserved their memory.
     pub(super) fn filled(columns: Columns, tables: &Tables) -> Self {
         Self { next_check: columns.len(), next_search: 2 * columns.len(), columns, text_bytes: tables.bytes() }
-    }
-
-    pub(super) fn columns(&self) -> &Columns {
-        &self.columns
-    }
-
-    pub(super) fn columns_mut(&mut self) -> &mut Columns {
-        &mut self.columns
-    }
-
-    pub(super) fn into_columns(self) -> Columns {
-        self.columns
     }
 
     /// Returns the finished structure.

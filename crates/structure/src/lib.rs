@@ -72,8 +72,8 @@ pub use error::StructureError;
 pub use kind_set::KindSet;
 pub use read::{ReadLimits, detect_format, read, read_with};
 pub use select::{
-    BadExpression, Context, Expression, LeftOut, ModelChoice, Selected, SelectedBlocks, SelectedOfBlock, Selection,
-    select, select_with,
+    BadExpression, Context, Expression, KindCount, LeftOut, ModelChoice, ResidueCount, Selected, SelectedBlocks,
+    SelectedOfBlock, Selection, select, select_with,
 };
 pub use source::{SourceFormat, Unread};
 pub use split::{AtomPart, Split};

@@ -79,9 +79,7 @@ fn cubes(columns: &Columns, rows: Range<usize>, reading: &Reading<'_>) -> Result
     let mut cubes: Vec<Content> = Vec::new();
     let mut latest = None;
     for i in rows {
-        if i % ROWS_PER_CHECK == 0 {
-            reading.check()?;
-        }
+        reading.check_every(i, ROWS_PER_CHECK)?;
         let (_, at) = columns.model_and_position(i);
         #[expect(clippy::cast_possible_truncation, reason = "coordinates are within ±100,000 Å")]
         let cube = at.map(|c| (c / FAR).floor() as i32);

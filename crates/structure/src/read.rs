@@ -100,6 +100,12 @@ impl<'a> Reading<'a> {
         check(self.control)
     }
 
+    /// Fails as [`Self::check`] does, for every `step`-th `n` only.
+    #[inline]
+    pub(super) fn check_every(&self, n: usize, step: usize) -> Result<(), StructureError> {
+        check_every(self.control, n, step)
+    }
+
     /// Reserves memory until the reservation is dropped.
     pub(super) fn reserve(&self, bytes: u64) -> Result<Reservation, StructureError> {
         Ok(self.control.reserve(bytes)?)
@@ -119,6 +125,12 @@ impl<'a> Reading<'a> {
 /// Fails if the caller cancelled.
 pub(super) fn check(control: &Control<'_>) -> Result<(), StructureError> {
     if control.cancel.is_cancelled() { Err(StructureError::Cancelled) } else { Ok(()) }
+}
+
+/// Fails as [`check`] does, for every `step`-th `n` only.
+#[inline]
+pub(super) fn check_every(control: &Control<'_>, n: usize, step: usize) -> Result<(), StructureError> {
+    if n.is_multiple_of(step) { check(control) } else { Ok(()) }
 }
 
 /// Maximum absolute value of a coordinate, Å. No structure file format has columns for larger values.

@@ -1,5 +1,7 @@
 //! Contents of a file besides the columns of its atoms.
 
+use molmesh_surface::named;
+
 use super::annotations::Annotations;
 use super::assembly::Assemblies;
 use super::kinds::Sequence;
@@ -19,19 +21,7 @@ pub enum SourceFormat {
     Xyz,
 }
 
-impl SourceFormat {
-    /// Returns `pdb`, `mmcif`, `bcif`, `pqr` or `xyz`.
-    #[must_use]
-    pub const fn name(self) -> &'static str {
-        match self {
-            Self::Pdb => "pdb",
-            Self::Mmcif => "mmcif",
-            Self::BinaryCif => "bcif",
-            Self::Pqr => "pqr",
-            Self::Xyz => "xyz",
-        }
-    }
-}
+named!(SourceFormat, Pdb => "pdb", Mmcif => "mmcif", BinaryCif => "bcif", Pqr => "pqr", Xyz => "xyz");
 
 /// Numbers of the atoms of a file that its structure does not contain.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]

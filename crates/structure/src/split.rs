@@ -1,6 +1,6 @@
 //! Division of the selected atoms into parts: each gets its own closed mesh, or its triangles of one surface.
 
-use molmesh_surface::{Control, Exceeded, Limit};
+use molmesh_surface::{Control, Exceeded, Limit, named};
 use rustc_hash::FxHashMap;
 
 use super::altloc::ATOMS_PER_CHECK;
@@ -8,7 +8,7 @@ use super::atoms::Structure;
 use super::contents::Kind;
 use super::copies::Unit;
 use super::error::StructureError;
-use super::read::{ReadLimits, check};
+use super::read::{ReadLimits, check_every};
 use super::select::Selected;
 
 /// Rule that divides atoms into parts.
@@ -29,34 +29,14 @@ pub enum Split {
     Pocket,
 }
 
+named!(Split, None => "none", Chain => "chain", Entity => "entity", Model => "model", ResidueGroup => "residue-group",
+    Pocket => "pocket");
+
 impl Split {
-    /// All values of the parameter `split`.
-    pub const ALL: [Self; 5] = [Self::None, Self::Chain, Self::Entity, Self::ResidueGroup, Self::Pocket];
-
-    /// Returns the value of the parameter `split`, or the name of the rule.
-    #[must_use]
-    pub const fn name(self) -> &'static str {
-        match self {
-            Self::None => "none",
-            Self::Chain => "chain",
-            Self::Entity => "entity",
-            Self::Model => "model",
-            Self::ResidueGroup => "residue-group",
-            Self::Pocket => "pocket",
-        }
-    }
-
     /// Returns the parameter that divides the surface, with its value.
     #[must_use]
-    pub const fn parameter(self) -> &'static str {
-        match self {
-            Self::None => "split=none",
-            Self::Chain => "split=chain",
-            Self::Entity => "split=entity",
-            Self::ResidueGroup => "split=residue-group",
-            Self::Pocket => "split=pocket",
-            Self::Model => "model=all",
-        }
+    pub fn parameter(self) -> String {
+        if self == Self::Model { "model=all".to_owned() } else { format!("split={self}") }
     }
 
     /// Returns the error for more parts than allowed.
@@ -119,9 +99,7 @@ impl Selected {
         let mut found: FxHashMap<(i64, &str), usize> = FxHashMap::default();
         let mut copies = self.copies.iter().enumerate().peekable();
         for (row, index) in (0_usize..).zip(0_u32..).take(self.atoms.len()) {
-            if row % ATOMS_PER_CHECK == 0 {
-                check(control)?;
-            }
+            check_every(control, row, ATOMS_PER_CHECK)?;
             while copies.peek().is_some_and(|(_, copy)| copy.rows.end <= row) {
                 copies.next();
             }

@@ -21,7 +21,7 @@ use std::sync::mpsc::{self, RecvTimeoutError};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use molmesh_surface::{Control, Reservation};
+use molmesh_surface::{Control, Reservation, named};
 use pdbtbx::{Context, ErrorLevel, Format, PDBError, ReadOptions, StrictnessLevel};
 
 use super::error::StructureError;
@@ -64,17 +64,7 @@ pub enum Level {
     Error,
 }
 
-impl Level {
-    /// Returns `note`, `warning` or `error`.
-    #[must_use]
-    pub const fn name(self) -> &'static str {
-        match self {
-            Self::Note => "note",
-            Self::Warning => "warning",
-            Self::Error => "error",
-        }
-    }
-}
+named!(Level, Note => "note", Warning => "warning", Error => "error");
 
 /// One finding.
 #[derive(Debug, Clone, PartialEq, Eq)]

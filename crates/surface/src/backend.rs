@@ -157,6 +157,21 @@ impl BackendIdentity {
     }
 }
 
+/// Spheres to mesh, and the receiver of the mesh.
+#[derive(Clone, Copy)]
+pub struct BackendJob<'a> {
+    /// Spheres.
+    pub spheres: &'a Spheres,
+    /// Parameters of the surface.
+    pub params: &'a SurfaceParams,
+    /// Limits of the run.
+    pub limits: &'a SurfaceLimits,
+    /// Cancellation, progress and memory.
+    pub control: &'a Control<'a>,
+    /// Receiver; `None` to return the mesh.
+    pub sink: Option<&'a dyn MeshSink>,
+}
+
 /// A meshing backend. The same input gives the same bytes on any number of threads.
 pub trait Backend: Send + Sync {
     /// Short stable name: `cpu`, `reference`, `gpu`.
@@ -181,18 +196,11 @@ pub trait Backend: Send + Sync {
         BackendIdentity::new(self.name(), self.arithmetic(), self.describe())
     }
 
-    /// Meshes `spheres`, in memory or, if there is a `sink`, into the sink. Both get the same rows.
+    /// Meshes the spheres of `job`, in memory or into its sink. Both get the same rows.
     ///
     /// # Errors
     /// Any [`SurfaceError`]; limits are checked before memory is allocated. [`SurfaceError::Sink`] if the sink fails.
-    fn write(
-        &self,
-        spheres: &Spheres,
-        params: &SurfaceParams,
-        limits: &SurfaceLimits,
-        control: &Control<'_>,
-        sink: Option<&dyn MeshSink>,
-    ) -> Result<MeshOutput, SurfaceError>;
+    fn write(&self, job: &BackendJob<'_>) -> Result<MeshOutput, SurfaceError>;
 
     /// Meshes `spheres` in memory.
     ///
@@ -205,7 +213,7 @@ pub trait Backend: Send + Sync {
         limits: &SurfaceLimits,
         control: &Control<'_>,
     ) -> Result<MeshOutput, SurfaceError> {
-        self.write(spheres, params, limits, control, None)
+        self.write(&BackendJob { spheres, params, limits, control, sink: None })
     }
 
     /// Returns a backend for one job, whose meshes must come from the same backend: after a fallback, it stays with the

@@ -168,7 +168,7 @@ mod tests {
     use crate::backend::Backend;
     use crate::control::{Observer, Stage};
     use crate::cpu::CpuBackend;
-    use crate::occupancy::Occupancy;
+    use crate::occupancy::{self, Occupancy};
     use crate::params::SurfaceOptions;
 
     fn at_one_point(n: usize) -> Spheres {
@@ -187,7 +187,7 @@ mod tests {
     /// Exact number of candidate pairs.
     fn pairs(spheres: &Spheres, params: &SurfaceParams) -> u64 {
         let (lattice, limits) = (Lattice::new(spheres, params, &Control::default()).unwrap(), SurfaceLimits::default());
-        Occupancy::new(&lattice, &limits, &Control::default()).unwrap().n_candidates()
+        occupancy::count(&lattice, &limits, &Control::default()).unwrap().candidates
     }
 
     /// True once the field was evaluated.

@@ -6,6 +6,7 @@ use std::time::Instant;
 
 use super::error::SurfaceError;
 use super::memory::{MemoryMeter, OutOfMemory, Reservation};
+use crate::named;
 
 /// Stages of a meshing run, in order.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -32,38 +33,8 @@ pub enum Stage {
     Improve,
 }
 
-impl Stage {
-    /// Every stage, in the order in which they run.
-    pub const ALL: [Self; 10] = [
-        Self::Bin,
-        Self::Field,
-        Self::Classify,
-        Self::Scan,
-        Self::Refine,
-        Self::Interpolate,
-        Self::Emit,
-        Self::Measure,
-        Self::Write,
-        Self::Improve,
-    ];
-
-    /// The stage's name, as shaders, reports and `Server-Timing` spell it.
-    #[must_use]
-    pub const fn name(self) -> &'static str {
-        match self {
-            Self::Bin => "bin",
-            Self::Field => "field",
-            Self::Classify => "classify",
-            Self::Scan => "scan",
-            Self::Refine => "refine",
-            Self::Interpolate => "interpolate",
-            Self::Emit => "emit",
-            Self::Write => "write",
-            Self::Measure => "measure",
-            Self::Improve => "improve",
-        }
-    }
-}
+named!(Stage, Bin => "bin", Field => "field", Classify => "classify", Scan => "scan", Refine => "refine",
+    Interpolate => "interpolate", Emit => "emit", Measure => "measure", Write => "write", Improve => "improve");
 
 /// Watches a run. Called from several threads at once, a few thousand times a run at most.
 pub trait Observer: Sync {
@@ -140,6 +111,15 @@ impl Control<'_> {
     /// Returns [`SurfaceError::Cancelled`] if the token is cancelled.
     pub fn check(&self) -> Result<(), SurfaceError> {
         if self.cancel.is_cancelled() { Err(SurfaceError::Cancelled) } else { Ok(()) }
+    }
+
+    /// Fails as [`Self::check`] does, for every `step`-th `n` only.
+    ///
+    /// # Errors
+    /// [`SurfaceError::Cancelled`].
+    #[inline]
+    pub fn check_every(&self, n: usize, step: usize) -> Result<(), SurfaceError> {
+        if n.is_multiple_of(step) { self.check() } else { Ok(()) }
     }
 
     /// Reserves `bytes` of memory until the reservation is dropped.

@@ -5,6 +5,8 @@ use std::fmt;
 use std::str::FromStr;
 use std::time::Duration;
 
+use crate::named;
+
 /// Default of the minimum number of bricks per device in a multi-device job. On an H200 these bricks take about 3 ms. A
 /// partition costs 10 to 25 % more than its bricks alone: one halo brick in twenty, two round trips, and the exchange
 /// of counts.
@@ -95,19 +97,8 @@ pub enum DeviceKind {
     Software,
 }
 
-impl DeviceKind {
-    /// Name of the kind, as in `doctor` and `/v1/capabilities`.
-    #[must_use]
-    pub const fn name(self) -> &'static str {
-        match self {
-            Self::Discrete => "discrete",
-            Self::Virtual => "virtual",
-            Self::Integrated => "integrated",
-            Self::Unknown => "unknown",
-            Self::Software => "software",
-        }
-    }
-}
+named!(DeviceKind, Discrete => "discrete", Virtual => "virtual", Integrated => "integrated", Unknown => "unknown",
+    Software => "software");
 
 /// Properties that a device reports.
 #[derive(Debug, Clone, PartialEq, Eq)]

@@ -14,8 +14,6 @@ mod cube;
 mod patch;
 mod shapes;
 
-use std::fmt;
-use std::str::FromStr;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use rayon::prelude::*;
@@ -25,12 +23,12 @@ pub use self::shapes::TriangleShapes;
 use super::control::{Control, Stage};
 use super::cpu::points::PointField;
 use super::error::SurfaceError;
-use super::kind::named;
 use super::lattice::{to_f32, to_i32, to_u32};
 use super::mesh::Mesh;
 use super::params::{SurfaceLimits, SurfaceParams};
 use super::spheres::Spheres;
 use super::triangle::Vector;
+use crate::named;
 
 /// Edge length of a cube, spacings.
 const SIDE: i32 = 24;
@@ -55,7 +53,7 @@ pub enum TriangleQuality {
     High,
 }
 
-named!(TriangleQuality, "quality", Standard => "standard", High => "high");
+named!(TriangleQuality, Standard => "standard", High => "high");
 
 /// Position of a cube, in edge lengths.
 type CubeIndex = [i32; 3];

@@ -1,10 +1,5 @@
 //! Named values of parameters: surfaces, kernels and presets.
 
-use std::fmt;
-use std::str::FromStr;
-
-use super::error::SurfaceError;
-
 /// The density that one atom contributes, as a function of the distance to its centre.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
 pub enum Kernel {
@@ -84,46 +79,39 @@ pub enum Preset {
     Quicksurf,
 }
 
-/// Implements names, [`Display`](fmt::Display) and [`FromStr`] for an enum of named values.
+/// Implements names and [`Display`](std::fmt::Display) for an enum of named values.
+#[macro_export]
 macro_rules! named {
-    ($type:ident, $what:literal, $($variant:ident => $name:literal),+ $(,)?) => {
+    ($type:ident, $($variant:ident => $name:literal),+) => {
         impl $type {
             /// Every value, in documentation order.
-            pub const ALL: &'static [Self] = &[$(Self::$variant),+];
+            pub const ALL: [Self; Self::NAMES.len()] = [$(Self::$variant),+];
             /// Names of all values.
             pub const NAMES: &'static [&'static str] = &[$($name),+];
 
-            /// Returns the name of the value in queries, in JSON and on the command line.
+            /// Returns the name of the value in parameters, reports and files.
             #[must_use]
             pub const fn name(self) -> &'static str {
                 match self { $(Self::$variant => $name),+ }
             }
-        }
 
-        impl fmt::Display for $type {
-            fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-                f.write_str(self.name())
+            /// Returns the value with this name.
+            #[must_use]
+            pub fn named(name: &str) -> Option<Self> {
+                Self::ALL.into_iter().find(|value| value.name() == name)
             }
         }
 
-        impl FromStr for $type {
-            type Err = SurfaceError;
-
-            fn from_str(text: &str) -> Result<Self, Self::Err> {
-                Self::ALL.iter().copied().find(|v| v.name() == text).ok_or_else(|| SurfaceError::BadParameter {
-                    name: $what,
-                    value: format!("`{text}`"),
-                    expected: format!("one of {}", Self::NAMES.join(", ")),
-                })
+        impl std::fmt::Display for $type {
+            fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+                f.write_str(self.name())
             }
         }
     };
 }
 
-pub(super) use named;
-
-named!(Kernel, "kernel", Gaussian => "gaussian", SoftObject => "soft-object", InverseSquare => "inverse-square");
-named!(SurfaceKind, "surface", Gaussian => "gaussian", SoftObject => "soft-object",
+named!(Kernel, Gaussian => "gaussian", SoftObject => "soft-object", InverseSquare => "inverse-square");
+named!(SurfaceKind, Gaussian => "gaussian", SoftObject => "soft-object",
     InverseSquare => "inverse-square", Vdw => "vdw", Sas => "sas", Ses => "ses");
-named!(Preset, "preset", Default => "default", SesLike => "ses-like", VdwLike => "vdw-like", Molstar => "molstar",
+named!(Preset, Default => "default", SesLike => "ses-like", VdwLike => "vdw-like", Molstar => "molstar",
     Blinn => "blinn", Quicksurf => "quicksurf");

@@ -13,7 +13,7 @@ use super::column::Column;
 use super::control::Control;
 use super::error::SurfaceError;
 use super::kernel::Shape;
-use super::params::SurfaceParams;
+use super::params::{SurfaceParams, bad};
 use super::spheres::Spheres;
 
 /// Grid points along a brick's edge.
@@ -86,8 +86,7 @@ impl Lattice {
     pub fn new(spheres: &Spheres, params: &SurfaceParams, control: &Control<'_>) -> Result<Self, SurfaceError> {
         let Some([lo, hi]) = spheres.bounds() else { return Err(SurfaceError::NoSpheres) };
         if spheres.len() > MAX_ATOMS {
-            let expected = format!("at most {MAX_ATOMS} spheres");
-            return Err(SurfaceError::BadParameter { name: "spheres", value: spheres.len().to_string(), expected });
+            return Err(bad("spheres", spheres.len(), format!("at most {MAX_ATOMS} spheres")));
         }
         let spacing = params.resolution;
         let shape = Shape::new(params);

@@ -46,7 +46,7 @@ pub mod triangle_grid;
 pub mod union_find;
 pub mod vector;
 
-pub use backend::{Backend, BackendIdentity, GridStats, MeshOutput, StreamedMesh};
+pub use backend::{Backend, BackendIdentity, BackendJob, GridStats, MeshOutput, StreamedMesh};
 pub use cavities::Cavity;
 pub use column::{Column, SharedBytes};
 pub use control::{CancelOnDrop, CancelToken, Control, Observer, Stage};

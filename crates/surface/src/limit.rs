@@ -9,51 +9,10 @@ use std::fmt;
 /// Coarsest grid spacing that is accepted, Å.
 pub const MAX_RESOLUTION: f64 = 20.0;
 
-/// Limit. [`LIMITS`] describes it.
-#[expect(missing_docs, reason = "the rows of the table describe the limits")]
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Limit {
-    BodyBytes,
-    PartHeadBytes,
-    FormParts,
-    InflatedBytes,
-    MapBytes,
-    MapPoints,
-    Atoms,
-    Duplicates,
-    Copies,
-    Parts,
-    ModelParts,
-    Distances,
-    GridPoints,
-    PocketPoints,
-    PocketRows,
-    Candidates,
-    Overlaps,
-    MeshBytes,
-    Triangles,
-    Tiles,
-    TilesetBytes,
-    PictureWidth,
-    PictureHeight,
-    DeviceBytes,
-    FileBytes,
-    FileVertices,
-    FileTriangles,
-    AtomIndex,
-    EntryBytes,
-    StoreBytes,
-    ResultBytes,
-    JobRecords,
-    MemoryBytes,
-    ScratchBytes,
-}
-
 /// Row of the table of limits.
 #[derive(Debug)]
+#[non_exhaustive]
 pub struct LimitRow {
-    /// The limit.
-    pub limit: Limit,
     /// Subject of the error message, unless the error has another one.
     subject: &'static str,
     /// Rest of the sentence, with `{}` for the number.
@@ -71,104 +30,80 @@ pub struct LimitRow {
 }
 
 /// Row without names, the base of the others.
-const NONE: LimitRow = LimitRow {
-    limit: Limit::BodyBytes,
-    subject: "",
-    predicate: "",
-    key: None,
-    flag: None,
-    parameter: None,
-    hint: None,
-    problem: "",
-};
+const NONE: LimitRow =
+    LimitRow { subject: "", predicate: "", key: None, flag: None, parameter: None, hint: None, problem: "" };
 
-const PAIRS_KEY: Option<&str> = Some("limits.candidate_pairs");
-const PAIRS_FLAG: Option<&str> = Some("--max-candidates");
-const STORE_KEY: Option<&str> = Some("store.max_bytes");
+const PAIRS_KEY: &str = "limits.candidate_pairs";
+const PAIRS_FLAG: &str = "--max-candidates";
+const STORE_KEY: &str = "store.max_bytes";
 
-/// All limits, in the order of [`Limit`].
-#[rustfmt::skip]
-pub const LIMITS: &[LimitRow] = &[
-    LimitRow { limit: Limit::BodyBytes, subject: "the body", predicate: "has {} bytes", key: Some("limits.body_bytes"),
-        problem: "body-too-large", ..NONE },
-    LimitRow { limit: Limit::PartHeadBytes, subject: "the preamble or the headers of a part",
-        predicate: "have {} bytes", problem: "body-too-large", ..NONE },
-    LimitRow { limit: Limit::FormParts, subject: "the form", predicate: "has {} parts",
-        problem: "body-too-large", ..NONE },
-    LimitRow { limit: Limit::InflatedBytes, subject: "the structure", predicate: "has {} bytes",
-        key: Some("limits.inflated_bytes"), flag: Some("--max-input-bytes"), problem: "inflated-too-large", ..NONE },
-    LimitRow { limit: Limit::MapBytes, subject: "the map", predicate: "has {} bytes",
-        key: Some("limits.inflated_bytes"), flag: Some("--max-input-bytes"), parameter: Some("map"),
-        problem: "inflated-too-large", ..NONE },
-    LimitRow { limit: Limit::MapPoints, subject: "the map", predicate: "has {} points", flag: Some("--max-map-points"),
-        parameter: Some("map"), problem: "map-too-large", ..NONE },
-    LimitRow { limit: Limit::Atoms, subject: "the structure", predicate: "has {} atoms", key: Some("limits.atoms"),
-        flag: Some("--max-atoms"), problem: "too-many-atoms", ..NONE },
-    LimitRow { limit: Limit::Duplicates, subject: "a position", predicate: "has {} atoms",
-        flag: Some("--max-duplicates"), problem: "too-many-duplicates", ..NONE },
-    LimitRow { limit: Limit::Copies, subject: "the assembly", predicate: "has {} copies of chains",
-        flag: Some("--max-copies"), problem: "too-many-copies", ..NONE },
-    LimitRow { limit: Limit::Parts, subject: "split", predicate: "divides the selected atoms into {} parts",
-        flag: Some("--max-parts"), parameter: Some("split"), problem: "too-many-parts", ..NONE },
-    LimitRow { limit: Limit::ModelParts, subject: "model=all", predicate: "divides the selected atoms into {} parts",
-        flag: Some("--max-parts"), parameter: Some("model"), problem: "too-many-parts", ..NONE },
-    LimitRow { limit: Limit::Distances, subject: "`within`",
-        predicate: "tests {} distances between atoms (64 count as a pair)",
-        key: PAIRS_KEY, flag: PAIRS_FLAG, parameter: Some("select"),
-        hint: Some("fewer atoms after `of` or a smaller distance"), problem: "too-many-candidates" },
-    LimitRow { limit: Limit::GridPoints, subject: "the grid", predicate: "would need about {} grid points",
-        key: Some("limits.grid_points"), flag: Some("--max-grid-points"), problem: "grid-too-large", ..NONE },
-    LimitRow { limit: Limit::PocketPoints, subject: "the search for pockets", predicate: "would need {} grid points",
-        key: Some("limits.grid_points"), flag: Some("--max-grid-points"), parameter: Some("pockets"),
-        hint: Some("a smaller selection or a smaller pocket_probe"), problem: "grid-too-large" },
-    LimitRow { limit: Limit::PocketRows, subject: "the search for pockets",
-        predicate: "would pass over {} rows of grid points in reach of the probes (5 count as a pair)",
-        key: PAIRS_KEY, flag: PAIRS_FLAG,
-        parameter: Some("pockets"), hint: Some("fewer atoms, smaller radii or a smaller pocket_probe"),
-        problem: "too-many-candidates" },
-    LimitRow { limit: Limit::Candidates, subject: "the spheres",
-        predicate: "would reach at least {} grid bricks in total", key: PAIRS_KEY, flag: PAIRS_FLAG,
-        hint: Some("smaller radii or a coarser resolution"), problem: "too-many-candidates", ..NONE },
-    LimitRow { limit: Limit::Overlaps, subject: "enlarged by the probe, the spheres",
-        predicate: "have at least {} overlapping pairs (64 comparisons of overlaps count as a pair)",
-        key: PAIRS_KEY, flag: PAIRS_FLAG, hint: Some("a smaller probe or smaller radii"),
-        problem: "too-many-candidates", ..NONE },
-    LimitRow { limit: Limit::MeshBytes, subject: "the mesh", predicate: "would take about {} bytes",
-        key: Some("limits.mesh_bytes"), flag: Some("--max-mesh-bytes"), problem: "mesh-too-large", ..NONE },
-    LimitRow { limit: Limit::Triangles, subject: "the mesh", predicate: "has {} triangles",
-        flag: Some("--max-triangles"), parameter: Some("max_triangles"), problem: "mesh-too-large", ..NONE },
-    LimitRow { limit: Limit::Tiles, subject: "the tileset", predicate: "would have {} tiles",
-        hint: Some("a coarser resolution"), problem: "grid-too-large", ..NONE },
-    LimitRow { limit: Limit::TilesetBytes, subject: "the index of the tileset", predicate: "has {} bytes",
-        key: Some("limits.structure_cache_bytes"), problem: "too-much-memory", ..NONE },
-    LimitRow { limit: Limit::PictureWidth, subject: "the width of the picture", predicate: "is {} pixels",
-        parameter: Some("width"), problem: "picture-too-large", ..NONE },
-    LimitRow { limit: Limit::PictureHeight, subject: "the height of the picture", predicate: "is {} pixels",
-        parameter: Some("height"), problem: "picture-too-large", ..NONE },
-    LimitRow { limit: Limit::DeviceBytes, subject: "the job", predicate: "would need {} bytes of memory of the device",
-        hint: Some("the backend cpu"), problem: "device-memory", ..NONE },
-    LimitRow { limit: Limit::FileBytes, subject: "the file", predicate: "would have {} bytes",
-        problem: "mesh-too-large", ..NONE },
-    LimitRow { limit: Limit::FileVertices, subject: "the file", predicate: "would have {} vertices",
-        problem: "mesh-too-large", ..NONE },
-    LimitRow { limit: Limit::FileTriangles, subject: "the file", predicate: "would have {} triangles",
-        problem: "mesh-too-large", ..NONE },
-    LimitRow { limit: Limit::AtomIndex, subject: "an atom index in the file", predicate: "is {}",
-        parameter: Some("atom_ids"), hint: Some("the format ply"), problem: "mesh-too-large", ..NONE },
-    LimitRow { limit: Limit::EntryBytes, subject: "the file of the archive", predicate: "has {} bytes",
-        problem: "entry-too-large", ..NONE },
-    LimitRow { limit: Limit::StoreBytes, subject: "the file", predicate: "needs {} bytes in the store",
-        key: STORE_KEY, problem: "body-too-large", ..NONE },
-    LimitRow { limit: Limit::ResultBytes, subject: "the file", predicate: "would need {} bytes in the store",
-        key: STORE_KEY, problem: "mesh-too-large", ..NONE },
-    LimitRow { limit: Limit::JobRecords, subject: "the client", predicate: "would have {} open jobs on record",
-        key: Some("jobs.records_per_client"), problem: "too-many-jobs", ..NONE },
-    LimitRow { limit: Limit::MemoryBytes, subject: "the request", predicate: "needs at least {} bytes of memory at once",
-        key: Some("limits.memory_bytes"), problem: "too-much-memory", ..NONE },
-    LimitRow { limit: Limit::ScratchBytes, subject: "the index of the atoms",
-        predicate: "needs at least {} bytes of disk space", key: Some("limits.scratch_bytes"),
-        problem: "too-much-memory", ..NONE },
-];
+/// Defines all limits: name, subject, predicate, problem, and other fields of the row.
+macro_rules! limits {
+    ($($limit:ident: $subject:literal, $predicate:literal, $problem:literal $(, $field:ident: $value:expr)*;)+) => {
+        /// Limit. [`LIMITS`] describes it.
+        #[expect(missing_docs, reason = "the rows of the table describe the limits")]
+        #[derive(Debug, Clone, Copy, PartialEq, Eq)]
+        pub enum Limit { $($limit),+ }
+
+        /// All limits, in the order of [`Limit`].
+        pub const LIMITS: &[LimitRow] = &[$(LimitRow {
+            subject: $subject, predicate: $predicate, problem: $problem, $($field: Some($value),)* ..NONE
+        }),+];
+    };
+}
+
+limits! {
+    BodyBytes: "the body", "has {} bytes", "body-too-large", key: "limits.body_bytes";
+    PartHeadBytes: "the preamble or the headers of a part", "have {} bytes", "body-too-large";
+    FormParts: "the form", "has {} parts", "body-too-large";
+    InflatedBytes: "the structure", "has {} bytes", "inflated-too-large", key: "limits.inflated_bytes",
+        flag: "--max-input-bytes";
+    MapBytes: "the map", "has {} bytes", "inflated-too-large", key: "limits.inflated_bytes", flag: "--max-input-bytes",
+        parameter: "map";
+    MapPoints: "the map", "has {} points", "map-too-large", flag: "--max-map-points", parameter: "map";
+    Atoms: "the structure", "has {} atoms", "too-many-atoms", key: "limits.atoms", flag: "--max-atoms";
+    Duplicates: "a position", "has {} atoms", "too-many-duplicates", flag: "--max-duplicates";
+    Copies: "the assembly", "has {} copies of chains", "too-many-copies", flag: "--max-copies";
+    Parts: "split", "divides the selected atoms into {} parts", "too-many-parts", flag: "--max-parts",
+        parameter: "split";
+    ModelParts: "model=all", "divides the selected atoms into {} parts", "too-many-parts", flag: "--max-parts",
+        parameter: "model";
+    Distances: "`within`", "tests {} distances between atoms (64 count as a pair)", "too-many-candidates",
+        key: PAIRS_KEY, flag: PAIRS_FLAG, parameter: "select", hint: "fewer atoms after `of` or a smaller distance";
+    GridPoints: "the grid", "would need about {} grid points", "grid-too-large", key: "limits.grid_points",
+        flag: "--max-grid-points";
+    PocketPoints: "the search for pockets", "would need {} grid points", "grid-too-large", key: "limits.grid_points",
+        flag: "--max-grid-points", parameter: "pockets", hint: "a smaller selection or a smaller pocket_probe";
+    PocketRows: "the search for pockets",
+        "would pass over {} rows of grid points in reach of the probes (5 count as a pair)", "too-many-candidates",
+        key: PAIRS_KEY, flag: PAIRS_FLAG, parameter: "pockets",
+        hint: "fewer atoms, smaller radii or a smaller pocket_probe";
+    Candidates: "the spheres", "would reach at least {} grid bricks in total", "too-many-candidates", key: PAIRS_KEY,
+        flag: PAIRS_FLAG, hint: "smaller radii or a coarser resolution";
+    Overlaps: "enlarged by the probe, the spheres",
+        "have at least {} overlapping pairs (64 comparisons of overlaps count as a pair)", "too-many-candidates",
+        key: PAIRS_KEY, flag: PAIRS_FLAG, hint: "a smaller probe or smaller radii";
+    MeshBytes: "the mesh", "would take about {} bytes", "mesh-too-large", key: "limits.mesh_bytes",
+        flag: "--max-mesh-bytes";
+    Triangles: "the mesh", "has {} triangles", "mesh-too-large", flag: "--max-triangles", parameter: "max_triangles";
+    Tiles: "the tileset", "would have {} tiles", "grid-too-large", hint: "a coarser resolution";
+    TilesetBytes: "the index of the tileset", "has {} bytes", "too-much-memory", key: "limits.structure_cache_bytes";
+    PictureWidth: "the width of the picture", "is {} pixels", "picture-too-large", parameter: "width";
+    PictureHeight: "the height of the picture", "is {} pixels", "picture-too-large", parameter: "height";
+    DeviceBytes: "the job", "would need {} bytes of memory of the device", "device-memory", hint: "the backend cpu";
+    FileBytes: "the file", "would have {} bytes", "mesh-too-large";
+    FileVertices: "the file", "would have {} vertices", "mesh-too-large";
+    FileTriangles: "the file", "would have {} triangles", "mesh-too-large";
+    AtomIndex: "an atom index in the file", "is {}", "mesh-too-large", parameter: "atom_ids", hint: "the format ply";
+    EntryBytes: "the file of the archive", "has {} bytes", "entry-too-large";
+    StoreBytes: "the file", "needs {} bytes in the store", "body-too-large", key: STORE_KEY;
+    ResultBytes: "the file", "would need {} bytes in the store", "mesh-too-large", key: STORE_KEY;
+    JobRecords: "the client", "would have {} open jobs on record", "too-many-jobs", key: "jobs.records_per_client";
+    MemoryBytes: "the request", "needs at least {} bytes of memory at once", "too-much-memory",
+        key: "limits.memory_bytes";
+    ScratchBytes: "the index of the atoms", "needs at least {} bytes of disk space", "too-much-memory",
+        key: "limits.scratch_bytes";
+}
 
 impl Limit {
     /// Returns the row of the limit.
@@ -294,9 +229,8 @@ mod tests {
     use super::*;
 
     #[test]
-    fn rows_are_in_the_order_of_the_limits() {
-        for (i, row) in LIMITS.iter().enumerate() {
-            assert_eq!(row.limit as usize, i, "{row:?}");
+    fn rows_have_a_subject_a_predicate_and_a_problem() {
+        for row in LIMITS {
             assert!(row.predicate.contains("{}") && !row.subject.is_empty() && !row.problem.is_empty(), "{row:?}");
         }
     }

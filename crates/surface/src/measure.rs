@@ -1,16 +1,13 @@
 //! Measures of a mesh (area, volume, components) and the validation that it is closed.
 
-use std::fmt;
-use std::str::FromStr;
-
 use super::control::Control;
 use super::error::SurfaceError;
-use super::kind::named;
 use super::mesh::Mesh;
 use super::sums::edge_shares;
 use super::topology::{self, Topology};
 use super::union_find::UnionFind;
 use super::vector::{area_vector, length};
+use crate::named;
 
 /// Method of validating closedness and manifoldness.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -25,7 +22,7 @@ pub enum Validation {
     Exact,
 }
 
-named!(Validation, "validation", Checksum => "checksum", Exact => "exact");
+named!(Validation, Checksum => "checksum", Exact => "exact");
 
 /// One connected component of a mesh.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]

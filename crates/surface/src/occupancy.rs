@@ -168,12 +168,6 @@ impl Occupancy {
         self.tiles.iter().map(|tile| count_ones(&tile.reached)).sum()
     }
 
-    /// Number of pairs of an occupied brick and an atom that reaches it.
-    #[must_use]
-    pub fn n_candidates(&self) -> u64 {
-        self.tiles.iter().map(|tile| tile.candidates).sum()
-    }
-
     /// Number of pairs of a brick and an atom that reaches one of its grid points.
     #[must_use]
     pub fn n_pairs(&self) -> u64 {

@@ -3,9 +3,9 @@
 //! The parallel backends are compared with it, as in Dias, Bora and Gomes (HPDC 2010). Its time grows with the number
 //! of atoms times the number of grid points. It shares only the formulas and the case table with the other backends.
 
-use super::backend::{Backend, GridStats, MeshOutput};
+use super::backend::{Backend, BackendJob, GridStats, MeshOutput};
 use super::cases::{CASES, cell_edge};
-use super::control::{Control, Stage};
+use super::control::Stage;
 use super::cpu::MAX_SHARE;
 use super::cpu::scan;
 use super::error::SurfaceError;
@@ -14,7 +14,6 @@ use super::lattice::{EDGE_MARGIN, to_f32, to_i32, to_u64};
 use super::limit::{Exceeded, Limit, slightly_coarser};
 use super::mesh::Mesh;
 use super::params::{SurfaceLimits, SurfaceParams};
-use super::sink::MeshSink;
 use super::spheres::Spheres;
 use super::vector::{add, dot, length, squared_distance, sub};
 
@@ -141,14 +140,8 @@ impl Backend for ReferenceBackend {
         "sequential reference, 1 thread, double precision".to_owned()
     }
 
-    fn write(
-        &self,
-        spheres: &Spheres,
-        params: &SurfaceParams,
-        limits: &SurfaceLimits,
-        control: &Control<'_>,
-        sink: Option<&dyn MeshSink>,
-    ) -> Result<MeshOutput, SurfaceError> {
+    fn write(&self, job: &BackendJob<'_>) -> Result<MeshOutput, SurfaceError> {
+        let BackendJob { spheres, params, limits, control, sink } = *job;
         params.check_radius(spheres.radius_range().0)?;
         let density = Density::new(spheres, params)?;
         let grid = DenseGrid::new(spheres, &density, params.resolution, limits)?;

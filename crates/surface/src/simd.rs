@@ -163,13 +163,13 @@ pub(super) mod tests {
             let options =
                 SurfaceOptions { surface: Some(surface), resolution: Some(0.7), atom_ids: true, ..Default::default() };
             let (params, control) = (SurfaceParams::new(&options).unwrap(), Control::default());
-            let output = CpuBackend::default().write(spheres, &params, limits, &control, None).unwrap();
+            let output = CpuBackend::default().run(spheres, &params, limits, &control).unwrap();
             let measures = Measures::of(&output.mesh, Validation::Checksum, &control).unwrap();
             let occupancy =
                 Occupancy::new(&Lattice::new(spheres, &params, &control).unwrap(), limits, &control).unwrap();
             format!("{output:?}\n{measures:?}\n{occupancy:?}")
         };
-        pool.build().unwrap().install(|| (arithmetic(), SurfaceKind::ALL.iter().copied().map(run).collect()))
+        pool.build().unwrap().install(|| (arithmetic(), SurfaceKind::ALL.into_iter().map(run).collect()))
     }
 
     #[test]

@@ -34,7 +34,7 @@ pub(super) const fn is_large(layout: BufferLayout) -> bool {
 #[derive(Debug)]
 pub(crate) struct GlbPlan {
     /// Everything before the buffer.
-    head: Vec<u8>,
+    pub(super) head: Vec<u8>,
     layout: Option<BufferLayout>,
     len: u32,
 }
@@ -63,11 +63,6 @@ impl GlbPlan {
     fn wrap(json: Vec<u8>, layout: Option<BufferLayout>) -> Result<Self, FormatError> {
         let (head, len) = head(json, layout.map(|layout| layout.len), layout.is_some_and(is_large))?;
         Ok(Self { head, layout, len })
-    }
-
-    /// Everything before the buffer.
-    pub(super) fn head(&self) -> &[u8] {
-        &self.head
     }
 
     pub(crate) fn len(&self) -> u64 {
@@ -156,7 +151,7 @@ mod tests {
     fn a_large_buffer_begins_at_a_fixed_offset() {
         let head = |json: usize, vertices: u64| {
             let layout = BufferLayout::plain([vertices, 1], Packing::Full).unwrap();
-            GlbPlan::wrap(vec![b' '; json], layout).unwrap().head().len() as u64
+            GlbPlan::wrap(vec![b' '; json], layout).unwrap().head.len() as u64
         };
         // 24 bytes a vertex and 3 indices of four bytes.
         let large = LARGE_BUFFER_BYTES.div_ceil(24);

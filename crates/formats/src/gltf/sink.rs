@@ -89,7 +89,7 @@ impl<'a> GlbSink<'a> {
         let size = self.size.get().copied().unwrap_or_default();
         let drawn = [Drawn::whole(size, &summary)];
         let plan = GlbPlan::placed(layout, &drawn, self.storage(), centre, &summary, meta)?;
-        let bytes = plan.head().len() as u64;
+        let bytes = plan.head.len() as u64;
         let large = layout.is_some_and(is_large);
         if large && bytes != HEAD_BYTES {
             return Err(GlbSinkError::HeadTooLong { bytes });

@@ -1,10 +1,9 @@
 //! Tables of exact areas.
 
 use std::io::{self, Write};
-use std::str::FromStr;
 
 use molmesh_structure::{Structure, table};
-use molmesh_surface::{AreaParts, Control, Reservation, SurfaceError};
+use molmesh_surface::{AreaParts, Control, Reservation, SurfaceError, named};
 use rustc_hash::FxHashMap;
 
 use super::{ATOMS_PER_CHECK, AtomAreas};
@@ -21,28 +20,7 @@ pub enum AreaLevel {
     Chain,
 }
 
-impl AreaLevel {
-    /// All levels.
-    pub const ALL: [Self; 3] = [Self::Atom, Self::Residue, Self::Chain];
-
-    /// Returns the name of the level.
-    #[must_use]
-    pub const fn name(self) -> &'static str {
-        match self {
-            Self::Atom => "atom",
-            Self::Residue => "residue",
-            Self::Chain => "chain",
-        }
-    }
-}
-
-impl FromStr for AreaLevel {
-    type Err = ();
-
-    fn from_str(text: &str) -> Result<Self, ()> {
-        Self::ALL.into_iter().find(|level| level.name() == text).ok_or(())
-    }
-}
+named!(AreaLevel, Atom => "atom", Residue => "residue", Chain => "chain");
 
 /// Row of a table: some atoms with the sums of their areas.
 pub(super) struct Row {
@@ -82,9 +60,7 @@ impl AtomAreas {
         let mut of_chains = FxHashMap::default();
         let mut before = None;
         for (n, &atom) in self.atoms.iter().enumerate() {
-            if n.is_multiple_of(ATOMS_PER_CHECK) {
-                control.check()?;
-            }
+            control.check_every(n, ATOMS_PER_CHECK)?;
             let i = atom as usize;
             let row = match level {
                 AreaLevel::Atom => rows.len(),

@@ -8,6 +8,7 @@ use molmesh_surface::triangle_grid::TriangleGrid;
 use molmesh_surface::vector::{joined_bounds, length, sub};
 use molmesh_surface::{Control, SurfaceError};
 use rayon::prelude::*;
+use serde::Serialize;
 
 use super::{Cube, CubeSide, Triangles, TrianglesByCube};
 
@@ -16,20 +17,23 @@ const MAX_MEAN_CUBES: usize = 200;
 /// Cubes between a triangle and the triangles that are nearest to it, at most.
 const CUBES_APART: i32 = 2;
 
-/// Distance between two surfaces at samples on both: vertices of the original, and points of the simplified one at
-/// most one grid spacing apart. No point of either surface is farther than one grid spacing from a sample, so the
-/// largest distance of any point exceeds `maximum` by at most one grid spacing.
-#[derive(Debug, Clone, Copy, Default, PartialEq)]
-pub struct Deviation {
-    /// Largest distance, Å.
-    pub maximum: f64,
-    /// Mean distance at the samples in at most 200 cubes, Å.
-    pub mean: f64,
-    /// Number of pairs of triangles of one part of the simplified mesh that intersect without a common edge.
+/// Size of the mesh before its simplification, and distance between the original and the simplified surface.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, utoipa::ToSchema)]
+pub struct SimplificationReport {
+    /// Number of triangles before the simplification.
+    pub triangles_before: u64,
+    /// Largest distance between the surfaces in Å, at samples: vertices of the original mesh, and points of the
+    /// simplified one at most one grid spacing apart. No point is farther than one grid spacing from a sample, so the
+    /// true maximum is at most one grid spacing larger.
+    pub max_deviation: f64,
+    /// Mean distance in Å at the samples in at most 200 cubes.
+    pub mean_deviation: f64,
+    /// Number of pairs of triangles of one part that intersect without a common edge. Simplification creates none
+    /// within a piece of the mesh, but triangles of neighbouring pieces can intersect.
     pub intersections: u64,
 }
 
-impl Deviation {
+impl SimplificationReport {
     /// Measures the distance between the triangles before and after a simplification. `max_distance` is the sum of the
     /// permitted errors of its passes, Å.
     ///
@@ -64,13 +68,14 @@ impl Deviation {
         let others: Vec<&Cube> = others.map(|(_, cube)| cube).collect();
         let maxima = others.into_par_iter().map(|cube| samples.maximum_above(*cube, largest_so_far));
         let maxima = maxima.collect::<Result<Vec<_>, SurfaceError>>()?;
-        let maximum = f64::from(maxima.into_iter().fold(largest_so_far, f32::max));
+        let max_deviation = f64::from(maxima.into_iter().fold(largest_so_far, f32::max));
         let intersections = |piece: &CubeRows| {
             control.check()?;
             Ok(simplified.intersections(piece, side))
         };
         let intersections = simplified.pieces.par_iter().map(intersections).sum::<Result<u64, SurfaceError>>()?;
-        Ok(Self { maximum, mean: sum / n.max(1) as f64, intersections })
+        let mean_deviation = sum / n.max(1) as f64;
+        Ok(Self { triangles_before: before.rows.len() as u64, max_deviation, mean_deviation, intersections })
     }
 }
 

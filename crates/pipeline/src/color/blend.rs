@@ -1,5 +1,7 @@
 //! Value of the parameter `color_blend`.
 
+use molmesh_surface::named;
+
 /// Transition between the colours of neighbouring vertices.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum ColorBlend {
@@ -10,16 +12,4 @@ pub enum ColorBlend {
     Smooth,
 }
 
-impl ColorBlend {
-    /// All values.
-    pub const ALL: [Self; 2] = [Self::Nearest, Self::Smooth];
-
-    /// Returns the value of the parameter.
-    #[must_use]
-    pub const fn name(self) -> &'static str {
-        match self {
-            Self::Nearest => "nearest",
-            Self::Smooth => "smooth",
-        }
-    }
-}
+named!(ColorBlend, Nearest => "nearest", Smooth => "smooth");

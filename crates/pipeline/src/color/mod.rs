@@ -76,7 +76,7 @@ pub struct LegendEntry {
 }
 
 /// Colours of a mesh.
-#[derive(Debug, Clone, Serialize, utoipa::ToSchema)]
+#[derive(Debug, Clone, Default, Serialize, utoipa::ToSchema)]
 pub struct ColorReport {
     /// Scheme, the value of the parameter `color`.
     pub scheme: String,
@@ -147,7 +147,8 @@ pub struct AtomColors<'a> {
     structure: &'a Structure,
     scheme: Scheme,
     palette: Palette,
-    range: [f64; 2],
+    /// Range of the values that are coloured.
+    pub(crate) range: [f64; 2],
     /// Colours by residue name, by chain, or of entities by `label_chain`.
     colors: Vec<Rgb>,
     /// Values by residue name.
@@ -232,8 +233,7 @@ impl<'a> AtomColors<'a> {
     /// Returns the colour of atom `i`, sRGB and opaque.
     #[must_use]
     pub fn of(&self, i: usize) -> [u8; 4] {
-        let [_, r, g, b] = self.rgb(i).to_be_bytes();
-        [r, g, b, u8::MAX]
+        opaque(self.rgb(i))
     }
 
     fn rgb(&self, i: usize) -> Rgb {
@@ -275,11 +275,6 @@ impl<'a> AtomColors<'a> {
         }
     }
 
-    /// Returns the range of the values that are coloured.
-    pub(crate) const fn range(&self) -> [f64; 2] {
-        self.range
-    }
-
     /// Returns the scheme, the range and the legend of the `selected` atoms.
     #[must_use]
     pub fn report(&self, selected: &[u32]) -> ColorReport {
@@ -294,12 +289,11 @@ impl<'a> AtomColors<'a> {
             .then(|| if self.confidences.is_some() { "ma_qa_metric_local" } else { "b_factor" });
         ColorReport {
             scheme: self.scheme.to_string(),
-            blend: None,
             source,
-            map: None,
             palette: has_numbers.then(|| self.palette.name()),
             range: has_numbers.then_some(self.range),
             legend,
+            ..ColorReport::default()
         }
     }
 
@@ -358,6 +352,12 @@ fn stops(palette: Palette, range: [f64; 2], round: impl Fn(f64) -> f64) -> Vec<L
     let [low, high] = range;
     let value = |stop: u32| round(low + (high - low) * f64::from(stop) / f64::from(STOPS - 1));
     (0..STOPS).map(value).map(|value| entry(value.to_string(), scaled(palette, range, value))).collect()
+}
+
+/// Returns a colour with its alpha, sRGB.
+fn opaque(color: Rgb) -> [u8; 4] {
+    let [_, r, g, b] = color.to_be_bytes();
+    [r, g, b, u8::MAX]
 }
 
 fn entry(label: String, color: Rgb) -> LegendEntry {

@@ -8,11 +8,10 @@ use rayon::prelude::*;
 use super::super::JobError;
 use super::super::pockets::lined_by;
 use super::of_map::{significant, symmetric_range};
-use super::palette::Rgb;
 use super::tables::{OTHER, category};
 use super::vertex::{self, MeshedSurface, ValueSource, VertexProperty};
 use super::{AtomColors, ColorBlend, ColorError, ColorReport, Coloring, MapReport, Palette, Scheme};
-use super::{MAX_ENTRIES, entry, extremes, of_vertices, round, scaled, stops};
+use super::{MAX_ENTRIES, entry, extremes, of_vertices, opaque, round, scaled, stops};
 
 /// Memory of a colour, bytes.
 const COLOR_BYTES: u64 = 4;
@@ -137,10 +136,9 @@ impl MeshColors {
                     scheme: scheme.to_string(),
                     palette: Some(palette.name()),
                     range: Some(range),
-                    blend: None,
-                    source: None,
                     map,
                     legend,
+                    ..ColorReport::default()
                 };
                 (Some(of_vertices(&values, color)), report)
             }
@@ -166,22 +164,8 @@ fn of_pockets(
     control.check()?;
     let color = |pocket: Option<u32>| opaque(pocket.map_or(OTHER, category));
     let legend = (0..).zip(&pockets.list).take(MAX_ENTRIES).map(|(i, _)| entry((i + 1).to_string(), category(i)));
-    let report = ColorReport {
-        scheme: scheme.to_string(),
-        palette: None,
-        range: None,
-        blend: None,
-        source: None,
-        map: None,
-        legend: legend.collect(),
-    };
+    let report = ColorReport { scheme: scheme.to_string(), legend: legend.collect(), ..ColorReport::default() };
     Ok((of_vertices(&lined, color), report))
-}
-
-/// Returns the bytes of an opaque colour.
-fn opaque(color: Rgb) -> [u8; 4] {
-    let [_, r, g, b] = color.to_be_bytes();
-    [r, g, b, u8::MAX]
 }
 
 /// Describes a map and counts the vertices without a value.

@@ -1,6 +1,8 @@
 //! Palettes of numeric schemes, interpolated between equidistant sRGB colours.
 #![expect(clippy::unreadable_literal, reason = "colours are written as in style sheets")]
 
+use molmesh_surface::named;
+
 /// Colour as `0xRRGGBB`, sRGB.
 pub(super) type Rgb = u32;
 
@@ -17,21 +19,10 @@ pub enum Palette {
     RedWhiteBlue,
 }
 
+named!(Palette, Viridis => "viridis", Cividis => "cividis", BlueWhiteRed => "blue-white-red",
+    RedWhiteBlue => "red-white-blue");
+
 impl Palette {
-    /// All palettes.
-    pub const ALL: [Self; 4] = [Self::Viridis, Self::Cividis, Self::BlueWhiteRed, Self::RedWhiteBlue];
-
-    /// Returns the value of the parameter.
-    #[must_use]
-    pub const fn name(self) -> &'static str {
-        match self {
-            Self::Viridis => "viridis",
-            Self::Cividis => "cividis",
-            Self::BlueWhiteRed => "blue-white-red",
-            Self::RedWhiteBlue => "red-white-blue",
-        }
-    }
-
     /// Returns the colour at `t`, from 0 to 1.
     pub(super) fn at(self, t: f64) -> Rgb {
         match self {

@@ -114,20 +114,16 @@ impl Scheme {
     }
 }
 
-/// Error: no scheme has this name.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct UnknownScheme;
-
 impl FromStr for Scheme {
-    type Err = UnknownScheme;
+    type Err = ();
 
-    fn from_str(text: &str) -> Result<Self, UnknownScheme> {
+    fn from_str(text: &str) -> Result<Self, ()> {
         if let Some(color) = text.strip_prefix("uniform:") {
             let digits = color.strip_prefix('#').unwrap_or(color);
             let is_color = digits.len() == 6 && digits.bytes().all(|c| c.is_ascii_hexdigit());
-            return Rgb::from_str_radix(digits, 16).ok().filter(|_| is_color).map(Self::Uniform).ok_or(UnknownScheme);
+            return Rgb::from_str_radix(digits, 16).ok().filter(|_| is_color).map(Self::Uniform).ok_or(());
         }
-        NAMED.iter().find(|(name, _)| *name == text).map(|(_, scheme)| *scheme).ok_or(UnknownScheme)
+        NAMED.iter().find(|(name, _)| *name == text).map(|(_, scheme)| *scheme).ok_or(())
     }
 }
 
@@ -157,7 +153,7 @@ mod tests {
         }
         for bad in ["", "Chain", "chains", "uniform", "uniform:", "uniform:#fff", "uniform:+fffff", "uniform:#ffffffff"]
         {
-            assert_eq!(bad.parse::<Scheme>(), Err(UnknownScheme), "{bad}");
+            assert_eq!(bad.parse::<Scheme>(), Err(()), "{bad}");
         }
     }
 }

@@ -41,72 +41,47 @@ pub(super) fn element(number: u8) -> Rgb {
     usize::from(number).checked_sub(1).and_then(|i| ELEMENTS.get(i)).copied().unwrap_or(OTHER)
 }
 
-/// Colours of residues: "amino" of `RasMol` (R. Sayle and E. J. Milner-White, Trends Biochem. Sci. 20, 374, 1995), and
-/// the nucleotides of Jmol.
-const RESIDUES: [(&str, Rgb); 26] = [
-    ("ALA", 0xc8c8c8),
-    ("ARG", 0x145aff),
-    ("ASN", 0x00dcdc),
-    ("ASP", 0xe60a0a),
-    ("CYS", 0xe6e600),
-    ("GLN", 0x00dcdc),
-    ("GLU", 0xe60a0a),
-    ("GLY", 0xebebeb),
-    ("HIS", 0x8282d2),
-    ("ILE", 0x0f820f),
-    ("LEU", 0x0f820f),
-    ("LYS", 0x145aff),
-    ("MET", 0xe6e600),
-    ("PHE", 0x3232aa),
-    ("PRO", 0xdc9682),
-    ("SER", 0xfa9600),
-    ("THR", 0xfa9600),
-    ("TRP", 0xb45ab4),
-    ("TYR", 0x3232aa),
-    ("VAL", 0x0f820f),
-    ("A", 0xa0a0ff),
-    ("C", 0xff8c4b),
-    ("G", 0xff7070),
-    ("I", 0x80ffff),
-    ("T", 0xa0ffa0),
-    ("U", 0xff8080),
+/// Colours and hydrophobicities of amino acids. The colours are "amino" of `RasMol` (R. Sayle and E. J. Milner-White,
+/// Trends Biochem. Sci. 20, 374, 1995). The values are the hydropathy index of J. Kyte and R. F. Doolittle, J. Mol.
+/// Biol. 157, 105 (1982), and the hydrophobicity of W. C. Wimley and S. H. White, Nat. Struct. Biol. 3, 842 (1996): the
+/// negative free energy of transfer of the whole residue from water to the interface of a POPC bilayer at pH 8,
+/// kcal/mol, with charged Asp and Glu and neutral His. High values are hydrophobic in both.
+const AMINO_ACIDS: [(&str, (Rgb, [f64; 2])); 20] = [
+    ("ALA", (0xc8c8c8, [1.8, -0.17])),
+    ("ARG", (0x145aff, [-4.5, -0.81])),
+    ("ASN", (0x00dcdc, [-3.5, -0.42])),
+    ("ASP", (0xe60a0a, [-3.5, -1.23])),
+    ("CYS", (0xe6e600, [2.5, 0.24])),
+    ("GLN", (0x00dcdc, [-3.5, -0.58])),
+    ("GLU", (0xe60a0a, [-3.5, -2.02])),
+    ("GLY", (0xebebeb, [-0.4, -0.01])),
+    ("HIS", (0x8282d2, [-3.2, -0.17])),
+    ("ILE", (0x0f820f, [4.5, 0.31])),
+    ("LEU", (0x0f820f, [3.8, 0.56])),
+    ("LYS", (0x145aff, [-3.9, -0.99])),
+    ("MET", (0xe6e600, [1.9, 0.23])),
+    ("PHE", (0x3232aa, [2.8, 1.13])),
+    ("PRO", (0xdc9682, [-1.6, -0.45])),
+    ("SER", (0xfa9600, [-0.8, -0.13])),
+    ("THR", (0xfa9600, [-0.7, -0.14])),
+    ("TRP", (0xb45ab4, [-0.9, 1.85])),
+    ("TYR", (0x3232aa, [-1.3, 0.94])),
+    ("VAL", (0x0f820f, [4.2, -0.07])),
 ];
+
+/// Colours of nucleotides in Jmol.
+const NUCLEOTIDES: [(&str, Rgb); 6] =
+    [("A", 0xa0a0ff), ("C", 0xff8c4b), ("G", 0xff7070), ("I", 0x80ffff), ("T", 0xa0ffa0), ("U", 0xff8080)];
 
 /// Returns the colour of a residue by its name.
 pub(super) fn residue(name: &str) -> Rgb {
-    find(&RESIDUES, parent(name)).unwrap_or(OTHER)
+    let name = parent(name);
+    find(&AMINO_ACIDS, name).map(|(color, _)| color).or_else(|| find(&NUCLEOTIDES, name)).unwrap_or(OTHER)
 }
-
-/// Hydropathy index of J. Kyte and R. F. Doolittle, J. Mol. Biol. 157, 105 (1982), and hydrophobicity of W. C. Wimley
-/// and S. H. White, Nat. Struct. Biol. 3, 842 (1996): the negative free energy of transfer of the whole residue from
-/// water to the interface of a POPC bilayer at pH 8, kcal/mol, with charged Asp and Glu and neutral His. High values
-/// are hydrophobic in both.
-const HYDROPHOBICITY: [(&str, [f64; 2]); 20] = [
-    ("ALA", [1.8, -0.17]),
-    ("ARG", [-4.5, -0.81]),
-    ("ASN", [-3.5, -0.42]),
-    ("ASP", [-3.5, -1.23]),
-    ("CYS", [2.5, 0.24]),
-    ("GLN", [-3.5, -0.58]),
-    ("GLU", [-3.5, -2.02]),
-    ("GLY", [-0.4, -0.01]),
-    ("HIS", [-3.2, -0.17]),
-    ("ILE", [4.5, 0.31]),
-    ("LEU", [3.8, 0.56]),
-    ("LYS", [-3.9, -0.99]),
-    ("MET", [1.9, 0.23]),
-    ("PHE", [2.8, 1.13]),
-    ("PRO", [-1.6, -0.45]),
-    ("SER", [-0.8, -0.13]),
-    ("THR", [-0.7, -0.14]),
-    ("TRP", [-0.9, 1.85]),
-    ("TYR", [-1.3, 0.94]),
-    ("VAL", [4.2, -0.07]),
-];
 
 /// Returns the two hydrophobicities of a residue by its name.
 pub(super) fn hydrophobicity(name: &str) -> Option<[f64; 2]> {
-    find(&HYDROPHOBICITY, parent(name))
+    find(&AMINO_ACIDS, parent(name)).map(|(_, values)| values)
 }
 
 /// Residues by formal charge at pH 7, from the pKa values of the side chains of free amino acids (CRC Handbook

@@ -57,8 +57,7 @@ pub fn parse(pairs: &[(String, String)]) -> Result<AreasRequest, ParamError> {
     let level = match &own[..] {
         [] => AreaLevel::default(),
         [(_, value)] => {
-            let levels = || AreaLevel::ALL.map(AreaLevel::name).join(", ");
-            value.parse().map_err(|()| ParamError::bad_value(BY, value, levels()))?
+            AreaLevel::named(value).ok_or_else(|| ParamError::bad_value(BY, value, AreaLevel::NAMES.join(", ")))?
         }
         _ => return Err(ParamError::Repeated { name: BY }),
     };

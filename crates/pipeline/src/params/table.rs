@@ -2,14 +2,16 @@
 
 use std::str::FromStr;
 
-use molmesh_picture::{Background, MAX_SIDE};
+use molmesh_formats::{Compress, Format, Normals, Units};
+use molmesh_picture::{Background, MAX_SIDE, Style, View};
+use molmesh_structure::{Context, Split};
 use molmesh_surface::params::{MAX_PROBE, MAX_RESOLUTION, MIN_RESOLUTION};
 use molmesh_surface::{POCKET_PROBES, Preset, SurfaceKind, TriangleQuality, Validation};
 
-use super::choices::{BLENDS, CAVITIES, COMPRESS, CONTEXTS, FORMATS, NORMALS, PALETTES, SPLITS, STYLES, UNITS, VIEWS};
 use super::{Domain, ParamError};
+use crate::color::{ColorBlend, Palette};
 use crate::spacing::{MAX_TRIANGLE_LIMIT, MIN_TRIANGLE_LIMIT};
-use crate::{SIMPLIFY_ERRORS, areas, color};
+use crate::{Cavities, SIMPLIFY_ERRORS, areas, color};
 
 /// One parameter.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -88,6 +90,9 @@ pub fn usual_range(parameter: &Parameter) -> Option<[f64; 2]> {
         _ => [min, max],
     })
 }
+
+/// Documented values of `split`.
+const SPLITS: &[&str] = &[Split::None.name(), Split::Chain.name(), Split::Entity.name(), Split::ResidueGroup.name()];
 
 /// All parameters in documentation order. A test checks that the bounds equal those of
 /// [`molmesh_surface::SurfaceParams::new`].
@@ -178,7 +183,7 @@ pub const TABLE: &[Parameter] = &[
     },
     Parameter {
         name: "palette",
-        domain: Domain::Choice(PALETTES),
+        domain: Domain::Choice(Palette::NAMES),
         default: "viridis for bfactor, occupancy, radial and depth, blue-white-red for hydrophobicity and curvature, red-white-blue for charge and map",
         doc: "Colours from the lowest to the highest value; for color=bfactor, occupancy, hydrophobicity, charge, curvature, radial, depth and map only.",
     },
@@ -190,7 +195,7 @@ pub const TABLE: &[Parameter] = &[
     },
     Parameter {
         name: "color_blend",
-        domain: Domain::Choice(BLENDS),
+        domain: Domain::Choice(ColorBlend::NAMES),
         default: "nearest",
         doc: "Transition between colours: nearest has sharp borders, smooth averages colours along the surface over about 1 Å.",
     },
@@ -245,7 +250,7 @@ pub const TABLE: &[Parameter] = &[
     },
     Parameter {
         name: "context",
-        domain: Domain::Choice(CONTEXTS),
+        domain: Domain::Choice(Context::NAMES),
         default: "selection",
         doc: "Atoms whose surface is made. selection: the selected atoms alone. whole: the polymer of all chains and the selected atoms; the mesh is then cut, and only the triangles that are nearest to selected atoms remain. It is open along the cut.",
     },
@@ -257,7 +262,7 @@ pub const TABLE: &[Parameter] = &[
     },
     Parameter {
         name: "cavities",
-        domain: Domain::Choice(CAVITIES),
+        domain: Domain::Choice(Cavities::NAMES),
         default: "absent",
         doc: "Searches for cavities, closed regions between the atoms that hold a probe, and lists them in the report. keep leaves the mesh as it is, drop removes its inner components around a cavity, only keeps nothing else.",
     },
@@ -305,25 +310,25 @@ pub const TABLE: &[Parameter] = &[
     },
     Parameter {
         name: "format",
-        domain: Domain::Choice(FORMATS),
+        domain: Domain::Choice(Format::NAMES),
         default: "glb",
         doc: "Output format: a mesh format, or png for a picture of the mesh. vert and face are the two files that MSMS writes for one mesh.",
     },
     Parameter {
         name: "compress",
-        domain: Domain::Choice(COMPRESS),
+        domain: Domain::Choice(Compress::NAMES),
         default: "none",
         doc: "Storage of glb and gltf: quantize uses 12 bytes per vertex instead of 24 (16-bit positions, 8-bit normals; KHR_mesh_quantization). meshopt, for glb only, also compresses vertices and indices; the file has about a fifth of the size (EXT_meshopt_compression).",
     },
     Parameter {
         name: "normals",
-        domain: Domain::Choice(NORMALS),
+        domain: Domain::Choice(Normals::NAMES),
         default: "smooth",
         doc: "Vertex normals. none omits them, and viewers shade each triangle flat; STL always has triangle normals, and vert vertex normals.",
     },
     Parameter {
         name: "units",
-        domain: Domain::Choice(UNITS),
+        domain: Domain::Choice(Units::NAMES),
         default: "angstrom",
         doc: "Unit of the coordinates in the file. glb and gltf scale their node, other formats their numbers (angstrom or nanometer only; vert and face angstrom only). Reports are always in Å.",
     },
@@ -341,7 +346,7 @@ pub const TABLE: &[Parameter] = &[
     },
     Parameter {
         name: "view",
-        domain: Domain::Choice(VIEWS),
+        domain: Domain::Choice(View::NAMES),
         default: "principal",
         doc: "Viewing direction of the picture; png only. principal looks along the shortest principal axis with the longest one horizontal; the others look along the axes of the file, front from +z with y up.",
     },
@@ -367,7 +372,7 @@ pub const TABLE: &[Parameter] = &[
     },
     Parameter {
         name: "style",
-        domain: Domain::Choice(STYLES),
+        domain: Domain::Choice(Style::NAMES),
         default: "surface",
         doc: "Shading of the picture; png only. gouraud interpolates the light of the vertices; surface adds ambient occlusion and an outline.",
     },

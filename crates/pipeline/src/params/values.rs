@@ -132,8 +132,8 @@ impl ParsedValues {
         };
         let options = &mut self.options;
         match parameter.name {
-            "preset" => self.surface.preset = Some(Preset::from_str(text).ok().ok_or_else(bad)?),
-            "surface" => self.surface.surface = Some(SurfaceKind::from_str(text).ok().ok_or_else(bad)?),
+            "preset" => self.surface.preset = Some(Preset::named(text).ok_or_else(bad)?),
+            "surface" => self.surface.surface = Some(SurfaceKind::named(text).ok_or_else(bad)?),
             "probe" => self.surface.probe = number()?,
             "resolution" => self.surface.resolution = number()?,
             "detail" => options.spacing = Spacing::Detail(level(text).ok_or_else(bad)?),
@@ -156,8 +156,8 @@ impl ParsedValues {
             "interface" => options.interface = Some(text.parse().ok().ok_or_else(bad)?),
             "color" if text == "none" => self.scheme = None,
             "color" => self.scheme = Some(text.parse().ok().ok_or_else(bad)?),
-            "palette" => self.palette = Some(named(&Palette::ALL, Palette::name, text).ok_or_else(bad)?),
-            "color_blend" => self.color_blend = named(&ColorBlend::ALL, ColorBlend::name, text).ok_or_else(bad)?,
+            "palette" => self.palette = Some(Palette::named(text).ok_or_else(bad)?),
+            "color_blend" => self.color_blend = ColorBlend::named(text).ok_or_else(bad)?,
             "color_offset" => self.color_offset = Some(bounded().ok_or_else(bad)?),
             "color_range" => self.color_range = Some(range(text).ok_or_else(bad)?),
             "model" => {
@@ -180,35 +180,30 @@ impl ParsedValues {
             }
             "instances" => options.selection.instances = flag(text).ok_or_else(bad)?,
             "unit" => options.selection.unit = Some(number_of_unit(parameter, text).ok_or_else(bad)?),
-            "context" => options.selection.context = named(&Context::ALL, Context::name, text).ok_or_else(bad)?,
-            "split" => options.split = named(&Split::ALL, Split::name, text).ok_or_else(bad)?,
-            "cavities" => options.cavities = Some(named(&Cavities::ALL, Cavities::name, text).ok_or_else(bad)?),
+            "context" => options.selection.context = Context::named(text).ok_or_else(bad)?,
+            "split" => options.split = Split::named(text).filter(|split| *split != Split::Model).ok_or_else(bad)?,
+            "cavities" => options.cavities = Some(Cavities::named(text).ok_or_else(bad)?),
             "pockets" => self.pockets = flag(text).ok_or_else(bad)?,
             "pocket_probe" => self.pocket_probe = Some(bounded().ok_or_else(bad)?),
             "altloc" => options.selection.altloc = Some(one_char(text).ok_or_else(bad)?),
-            "quality" => options.quality = TriangleQuality::from_str(text).ok().ok_or_else(bad)?,
-            "validation" => options.validation = Validation::from_str(text).ok().ok_or_else(bad)?,
+            "quality" => options.quality = TriangleQuality::named(text).ok_or_else(bad)?,
+            "validation" => options.validation = Validation::named(text).ok_or_else(bad)?,
             "check" => self.strict = (text == "strict").then_some(true).ok_or_else(bad)?,
             "format" => self.format = Some(Format::from_str(text).ok().ok_or_else(bad)?),
-            "compress" => options.compress = named(&Compress::ALL, Compress::name, text).ok_or_else(bad)?,
-            "normals" => options.normals = named(&Normals::ALL, Normals::name, text).ok_or_else(bad)?,
-            "units" => options.units = named(&Units::ALL, Units::name, text).ok_or_else(bad)?,
+            "compress" => options.compress = Compress::named(text).ok_or_else(bad)?,
+            "normals" => options.normals = Normals::named(text).ok_or_else(bad)?,
+            "units" => options.units = Units::named(text).ok_or_else(bad)?,
             "width" => self.picture().width = side().ok_or_else(bad)?,
             "height" => self.picture().height = side().ok_or_else(bad)?,
-            "view" => self.picture().view = named(&View::ALL, View::name, text).ok_or_else(bad)?,
+            "view" => self.picture().view = View::named(text).ok_or_else(bad)?,
             "azimuth" => self.picture().azimuth = bounded().ok_or_else(bad)?,
             "elevation" => self.picture().elevation = bounded().ok_or_else(bad)?,
             "background" => self.picture().background = text.parse::<Background>().ok().ok_or_else(bad)?,
-            "style" => self.picture().style = named(&Style::ALL, Style::name, text).ok_or_else(bad)?,
+            "style" => self.picture().style = Style::named(text).ok_or_else(bad)?,
             name => return Err(unknown(name, [])),
         }
         Ok(())
     }
-}
-
-/// Returns the value with this name.
-fn named<T: Copy>(all: &[T], name: impl Fn(T) -> &'static str, text: &str) -> Option<T> {
-    all.iter().copied().find(|value| name(*value) == text)
 }
 
 fn whole(text: &str) -> Option<u64> {

@@ -58,9 +58,7 @@ impl Buckets {
         // Successive atoms mostly lie in one bucket.
         let mut last = ([i64::MIN; 3], 0);
         for i in 0..spheres.len() {
-            if i.is_multiple_of(PER_CHECK) {
-                control.check()?;
-            }
+            control.check_every(i, PER_CHECK)?;
             let at = cube(spheres.centre(i), side);
             if at != last.0 {
                 let next = u32::try_from(numbers.len()).unwrap_or(u32::MAX);
@@ -75,9 +73,7 @@ impl Buckets {
         let mut groups = counts.groups();
         let mut last = ([i64::MIN; 3], 0);
         for (i, row) in (0..spheres.len()).zip(0_u32..) {
-            if i.is_multiple_of(PER_CHECK) {
-                control.check()?;
-            }
+            control.check_every(i, PER_CHECK)?;
             let at = cube(spheres.centre(i), side);
             if at != last.0 {
                 last = (at, numbers[&at] as usize);
@@ -143,6 +139,15 @@ impl TilesetLevel {
     pub(super) fn row(&self, sphere: u32) -> u32 {
         self.rows.as_ref().map_or(sphere, |rows| rows[sphere as usize])
     }
+}
+
+/// Returns the edge length of the buckets of a level, Å: the first doubling of `side` that is not too short. Buckets
+/// determine the order of groups of atoms.
+pub(super) fn bucket_side(mut side: f64) -> f64 {
+    while side < MIN_BUCKET {
+        side *= 2.0;
+    }
+    side
 }
 
 /// Returns the cube of edge length `side`, Å, that contains a point.

@@ -21,13 +21,14 @@ use molmesh_formats::Units;
 use molmesh_formats::tileset::{TileAddress, TilesetBounds};
 use molmesh_structure::{Context, ReadLimits, Selected, Split, Structure, StructureError};
 use molmesh_surface::clip::{influence, influence_of};
+use molmesh_surface::params::bad;
 use molmesh_surface::{
     Backend, Control, Exceeded, GridStats, Limit, Measures, Mesh, MeshOutput, Spheres, Stage, SurfaceError,
     SurfaceLimits, SurfaceParams, TriangleQuality, Validation,
 };
 
 use self::layout::Layout;
-use self::level::{Buckets, MIN_BUCKET, TilesetLevel};
+use self::level::{Buckets, TilesetLevel, bucket_side};
 use self::source::{LevelSource, NearSpheres, Streamed};
 pub use self::stream::{StreamSource, StructureStream, check_stream, needs_memory};
 pub use self::units::AssemblyTileset;
@@ -255,9 +256,8 @@ impl<S: Deref<Target = Structure>> Tileset<S> {
     ) -> Result<(MeshOutput, Option<ColorReport>), JobError> {
         let (address, levels) = (options.tile.unwrap_or(TileAddress::ROOT), self.layout.levels);
         if !address.is_valid(levels) {
-            let (value, last) = (format!("`{}`", address.path()), levels - 1);
-            let expected = format!("a tile of the tileset, whose levels are 0 to {last}");
-            return Err(SurfaceError::BadParameter { name: "tile", value, expected }.into());
+            let expected = format!("a tile of the tileset, whose levels are 0 to {}", levels - 1);
+            return Err(bad("tile", format!("`{}`", address.path()), expected).into());
         }
         let level = &self.levels[address.level as usize];
         let (spacing, bounds) = (self.layout.spacing(address.level), self.layout.tile(address));
@@ -322,10 +322,7 @@ impl Layout {
         control: &Control<'_>,
     ) -> Result<(Vec<LevelSource>, BTreeSet<TileAddress>), JobError> {
         let (mut levels, mut tiles) = (Vec::new(), BTreeSet::new());
-        let mut side = self.side(self.levels - 1);
-        while side < MIN_BUCKET {
-            side *= 2.0;
-        }
+        let side = bucket_side(self.side(self.levels - 1));
         let buckets = Arc::new(Buckets::new(spheres, side, control)?);
         for number in (0..self.levels).rev() {
             let lengths = [self.spacing(number), self.side(number)];
@@ -362,9 +359,7 @@ impl Layout {
         let mut last = None;
         let new = ranges.filter(|range| last.replace(*range) != Some(*range));
         for (n, tile) in new.flat_map(|range| Self::between(number, range)).enumerate() {
-            if n.is_multiple_of(PER_CHECK) {
-                control.check()?;
-            }
+            control.check_every(n, PER_CHECK)?;
             if !tiles.insert(tile) {
                 continue;
             }

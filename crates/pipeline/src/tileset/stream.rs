@@ -15,7 +15,7 @@ use molmesh_surface::{Control, MemoryMeter as _, Reservation, Spheres, SurfaceEr
 
 use super::Tileset;
 use super::layout::{CELLS, Layout};
-use super::level::{GROUP_ABOVE, MIN_BUCKET, cube, group_of};
+use super::level::{GROUP_ABOVE, MIN_BUCKET, bucket_side, cube, group_of};
 use super::source::{LevelSource, Streamed};
 use super::stored::{SphereIndex, SphereList, StoredSphere};
 use crate::color::{BlockColors, Scheme};
@@ -187,7 +187,7 @@ impl Tileset<Box<Structure>> {
     ) -> Result<Self, JobError> {
         let params = SurfaceParams { atom_ids: options.needs_atoms(), ..options.params.clone() };
         let [file, columns] = stream.scratch.map(|file| Arc::new(StoredBytes::new(file)));
-        let mut side = order_side(params.resolution);
+        let mut side = bucket_side(CELLS * params.resolution);
         while side >= 2.0 * MIN_BUCKET {
             side *= 0.5;
         }
@@ -283,15 +283,6 @@ fn place(
     })
 }
 
-/// Returns the edge length, Å, of the cubes that determine the order of groups of atoms in memory.
-fn order_side(finest: f64) -> f64 {
-    let mut side = CELLS * finest;
-    while side < MIN_BUCKET {
-        side *= 2.0;
-    }
-    side
-}
-
 /// Rejects meshed atoms of which more than allowed have the same position.
 fn check_duplicates(index: &SphereIndex, limits: &ReadLimits, control: &Control<'_>) -> Result<(), JobError> {
     for cubes in index.by_cell(0.0) {
@@ -320,7 +311,7 @@ fn grouped(
     spacing: f64,
     control: &Control<'_>,
 ) -> Result<SphereIndex, JobError> {
-    let side = order_side(params.resolution);
+    let side = bucket_side(CELLS * params.resolution);
     for cubes in atoms.by_cell(spacing) {
         let (mut spheres, _memory) = atoms.read(&cubes, control)?;
         let cell = |sphere: &StoredSphere| cube(sphere.centre, spacing);

@@ -48,7 +48,7 @@ impl<S: Deref<Target = Structure>> AssemblyTileset<S> {
         let needs_range = |coloring: &&Coloring| {
             coloring.range.is_none() && matches!(coloring.scheme, Scheme::BFactor | Scheme::Occupancy)
         };
-        let range = |coloring| Ok::<_, JobError>(AtomColors::new(&structure, &selected.atoms, coloring)?.range());
+        let range = |coloring| Ok::<_, JobError>(AtomColors::new(&structure, &selected.atoms, coloring)?.range);
         let range = options.color.as_ref().filter(needs_range).map(range).transpose()?;
         // A range without extent cannot be requested, and is the same for all units.
         let color_range = range.filter(|[low, high]| low < high);

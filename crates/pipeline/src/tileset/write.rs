@@ -238,7 +238,7 @@ impl<S: Deref<Target = Structure> + Sync> Tileset<S> {
         let address = "{level}/{x}/{y}/{z}";
         let uris = TilesetUris { content: format!("{address}.glb"), subtrees: format!("subtrees/{address}.subtree") };
         bytes += store("tileset.json", tileset_document(&bounds, &uris).to_string().as_bytes())?;
-        let (atoms, left_out) = (self.n_atoms(), LeftOutReport::new(&self.selected.left_out));
+        let (atoms, left_out) = (self.n_atoms(), self.selected.left_out.clone());
         Ok(TilesetReport {
             id: self.structure.id.clone(),
             atoms,

@@ -145,7 +145,7 @@ impl ColumnStream<'_> {
             mask.extend(self.buffer.iter().map(|&value| value != 0));
             n -= n.min(CHUNK);
         }
-        if stream.n() == self.n { Ok(()) } else { whole_column(stream.n(), self.rows) }
+        if stream.n == self.n { Ok(()) } else { whole_column(stream.n, self.rows) }
     }
 
     fn read_cells(&mut self, mut n: usize, column: &mut DecodedColumn<'_>) -> Result<(), Box<Fault>> {
@@ -170,10 +170,10 @@ impl ColumnStream<'_> {
                 }
             }
         }
-        if stream.n() == self.n {
+        if stream.n == self.n {
             return Ok(());
         }
-        whole_column(stream.n(), self.rows).map_err(|fault| located(fault, *is_dictionary, false))
+        whole_column(stream.n, self.rows).map_err(|fault| located(fault, *is_dictionary, false))
     }
 }
 

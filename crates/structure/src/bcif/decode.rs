@@ -19,7 +19,7 @@ pub(super) struct ValueStream<'a> {
     /// Conversion to real numbers, which ends the decoding.
     reals: Option<(Reals, Place)>,
     /// Number of values so far.
-    n: usize,
+    pub(super) n: usize,
     buffer: Vec<i32>,
 }
 
@@ -128,11 +128,6 @@ impl ValueStream<'_> {
     /// Rejects real numbers.
     pub(super) fn require_ints(&self) -> Result<(), Box<Fault>> {
         if self.is_real() { Err(Fault::new("real numbers", "whole numbers")) } else { Ok(()) }
-    }
-
-    /// Returns the number of values so far.
-    pub(super) const fn n(&self) -> usize {
-        self.n
     }
 
     pub(super) const fn is_real(&self) -> bool {

@@ -9,7 +9,7 @@ mod error;
 use std::fmt;
 
 pub use error::MapError;
-use molmesh_surface::{Control, Exceeded, Limit, MemoryMeter as _, OutOfMemory, Reservation};
+use molmesh_surface::{Control, Exceeded, Limit, MemoryMeter as _, OutOfMemory, Reservation, named};
 
 use super::decoder;
 
@@ -40,16 +40,7 @@ pub enum MapFormat {
     Dx,
 }
 
-impl MapFormat {
-    /// Returns the name in reports.
-    #[must_use]
-    pub const fn name(self) -> &'static str {
-        match self {
-            Self::Ccp4 => "ccp4",
-            Self::Dx => "dx",
-        }
-    }
-}
+named!(MapFormat, Ccp4 => "ccp4", Dx => "dx");
 
 /// Values at the points of a regular grid. Its axes may be oblique.
 pub struct Map {

@@ -271,9 +271,7 @@ impl<'a> Reader<'a> {
                 self.describe(item_ix, &token)?;
             }
             i += 1;
-            if i % VALUES_PER_CHECK == 0 {
-                self.reading.check()?;
-            }
+            self.reading.check_every(i, VALUES_PER_CHECK)?;
             token = self.tokens.next()?;
         }
         self.count_unread(&tags, (i / tags.len()) as u64);

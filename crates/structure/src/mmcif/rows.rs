@@ -45,7 +45,7 @@ impl<'a> TableRows<'a> {
 
     /// Returns the columns of the atoms, the tables of texts, and the warnings.
     pub(super) fn into_parts(self) -> (Columns, Tables, Warnings<Box<Fault>>) {
-        (self.columns.into_columns(), self.site.tables, self.site.warnings)
+        (self.columns.columns, self.site.tables, self.site.warnings)
     }
 
     /// Reads all rows, from the first value at offset `first` on. Returns the offset of the end of the loop.
@@ -325,7 +325,7 @@ mod tests {
         let reading = Reading::new(&limits, &control);
         let mut table = TableRows::new(text.as_bytes(), layout(&text), &reading);
         let stop = table.read_plain(TAGS.len()).unwrap()?;
-        Some((table.columns.columns().len(), stop - TAGS.len()))
+        Some((table.columns.columns.len(), stop - TAGS.len()))
     }
 
     #[test]

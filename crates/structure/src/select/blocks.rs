@@ -264,7 +264,7 @@ impl SelectedBlocks {
             if assembly.is_some_and(|assembly| !assembly.covers(number)) {
                 let LeftOut { other_models, .. } = counts.left_out;
                 left_out.other_models += other_models;
-                left_out.other_chains += counts.n_selected + counts.left_out.total() - other_models + of_names;
+                left_out.other_chains += counts.n_selected + counts.left_out.sum() - other_models + of_names;
                 continue;
             }
             n_selected += counts.n_selected;
@@ -278,9 +278,8 @@ impl SelectedBlocks {
             return Err(StructureError::EmptySelection { holds });
         }
         let counts = residues.iter().map(|((name, kind), n)| (name.as_str(), *kind, *n)).collect();
-        left_out.name_residues(counts);
-        left_out.add_unread(self.unread);
-        left_out.add_unread(self.unread_of_file);
+        self.begin_file();
+        left_out.finish(counts, self.unread);
         let (marks, copies, units) = (None, Vec::new(), Vec::new());
         let n_distinct = usize::try_from(n_selected).unwrap_or(usize::MAX);
         Ok(Selected { atoms: Vec::new(), marks, copies, units, n_distinct, model, left_out })

@@ -1,5 +1,7 @@
 //! Value of the parameter `context`.
 
+use molmesh_surface::named;
+
 /// Atoms whose surface is made.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
 pub enum Context {
@@ -11,16 +13,4 @@ pub enum Context {
     Whole,
 }
 
-impl Context {
-    /// All values.
-    pub const ALL: [Self; 2] = [Self::Selection, Self::Whole];
-
-    /// Returns the value of the parameter `context`.
-    #[must_use]
-    pub const fn name(self) -> &'static str {
-        match self {
-            Self::Selection => "selection",
-            Self::Whole => "whole",
-        }
-    }
-}
+named!(Context, Selection => "selection", Whole => "whole");

@@ -7,7 +7,7 @@ use molmesh_surface::{Control, MemoryMeter as _, Reservation};
 use super::expression::Condition;
 use super::{SELECTED_CHAIN, chains, known_chains, near};
 use crate::altloc::ATOMS_PER_CHECK;
-use crate::read::check;
+use crate::read::{check, check_every};
 use crate::{Structure, StructureError, TextColumn};
 
 /// Mark for each atom: true if it matches. Holds the memory reservation of the marks.
@@ -121,9 +121,7 @@ impl Evaluation<'_> {
         let s = self.structure;
         let mut first = 0;
         for i in 1..=marks.len() {
-            if i % ATOMS_PER_CHECK == 0 {
-                check(self.control)?;
-            }
+            check_every(self.control, i, ATOMS_PER_CHECK)?;
             if i == marks.len() || !s.same_residue(i - 1, i) {
                 if marks[first..i].contains(&true) {
                     marks[first..i].fill(true);

@@ -215,26 +215,17 @@ impl fmt::Display for Condition {
                 let symbols: Vec<&str> = numbers.iter().map(|&number| symbol(number)).collect();
                 write!(f, "elem {}", symbols.join(","))
             }
-            Self::Within(distance, of) => write!(f, "within {} of {}", distance.angstrom(), Operand(of)),
-            Self::ByResidue(of) => write!(f, "byres {}", Operand(of)),
-            Self::Not(of) => write!(f, "not {}", Operand(of)),
+            Self::Within(distance, of) => write!(f, "within {} of ({of})", distance.angstrom()),
+            Self::ByResidue(of) => write!(f, "byres ({of})"),
+            Self::Not(of) => write!(f, "not ({of})"),
             Self::And(parts) => f.write_str(&joined(parts, " and ")),
             Self::Or(parts) => f.write_str(&joined(parts, " or ")),
         }
     }
 }
 
-/// Condition, displayed in parentheses.
-struct Operand<'a>(&'a Condition);
-
-impl fmt::Display for Operand<'_> {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "({})", self.0)
-    }
-}
-
 fn joined(parts: &BTreeSet<Condition>, word: &str) -> String {
-    parts.iter().map(|part| Operand(part).to_string()).collect::<Vec<_>>().join(word)
+    parts.iter().map(|part| format!("({part})")).collect::<Vec<_>>().join(word)
 }
 
 /// Writes a set of kinds as a union of names.

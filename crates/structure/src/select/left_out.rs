@@ -2,42 +2,66 @@
 
 use std::collections::{BTreeMap, HashMap};
 
+use serde::Serialize;
+
 use crate::Kind;
 use crate::source::Unread;
 
 /// Maximum number of residue names that are counted separately.
 const MAX_NAMES: usize = 10;
 
-/// Atoms of the file that were not selected. Each is counted under the first reason that applies, in field order.
-#[derive(Debug, Clone, Default, PartialEq, Eq)]
+/// Number of atoms of one kind.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, utoipa::ToSchema)]
+pub struct KindCount {
+    /// Kind.
+    pub kind: &'static str,
+    /// Number of atoms.
+    pub atoms: u64,
+}
+
+/// Number of atoms of one kind with one residue name.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, utoipa::ToSchema)]
+pub struct ResidueCount {
+    /// Residue name.
+    pub name: String,
+    /// Kind.
+    pub kind: &'static str,
+    /// Number of atoms.
+    pub atoms: u64,
+}
+
+/// Atoms of the file that are not meshed. Each atom is counted once, under the first field that applies.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, utoipa::ToSchema)]
+#[schema(as = LeftOutReport)]
 pub struct LeftOut {
+    /// Total number of these atoms.
+    pub total: u64,
     /// Atoms of data blocks after the first one with atoms.
     pub other_blocks: u64,
-    /// Spheres of coarse-grained parts of integrative models.
+    /// Spheres of coarse-grained parts of integrative models (`ihm_sphere_obj_site`).
     pub spheres: u64,
-    /// Atoms of other models.
+    /// Atoms of models that are not selected.
     pub other_models: u64,
-    /// Atoms of other chains.
+    /// Atoms of chains that are not selected or not part of the assembly.
     pub other_chains: u64,
     /// Sites that are not atoms: charge sites of water models, lone pairs, Drude particles.
     pub virtual_sites: u64,
-    /// Atoms of residues that are not selected, by kind, most frequent first.
-    pub kinds: Vec<(Kind, u64)>,
-    /// The atoms of `kinds` by residue name and kind, most frequent first; at most ten.
-    pub residues: Vec<(String, Kind, u64)>,
+    /// Atoms of residues that are not selected, by kind.
+    pub kinds: Vec<KindCount>,
+    /// The atoms of `kinds` by residue name and kind; the ten most frequent.
+    pub residues: Vec<ResidueCount>,
     /// The atoms of `kinds` that `residues` does not list.
     pub other_residues: u64,
-    /// Hydrogen and deuterium of selected residues.
+    /// Hydrogen atoms of meshed residues.
     pub hydrogens: u64,
-    /// Other alternative locations of selected residues.
+    /// Alternative locations of meshed residues other than the selected one.
     pub alternatives: u64,
 }
 
 impl LeftOut {
-    /// Returns the number of atoms and sites that were not selected.
-    #[must_use]
-    pub fn total(&self) -> u64 {
-        let of_kinds: u64 = self.kinds.iter().map(|(_, n)| n).sum();
+    /// Returns the sum of all counts.
+    pub(super) fn sum(&self) -> u64 {
+        let of_kinds: u64 = self.kinds.iter().map(|kind| kind.atoms).sum();
         of_kinds
             + self.other_blocks
             + self.spheres
@@ -46,12 +70,6 @@ impl LeftOut {
             + self.virtual_sites
             + self.hydrogens
             + self.alternatives
-    }
-
-    /// Adds the atoms of a file that were not read.
-    pub(super) fn add_unread(&mut self, unread: Unread) {
-        self.other_blocks += unread.blocks;
-        self.spheres += unread.spheres;
     }
 
     /// Adds the counts of other atoms, without kinds and residue names.
@@ -63,18 +81,22 @@ impl LeftOut {
         self.alternatives += other.alternatives;
     }
 
-    /// Sets the counts of kinds and residue names.
-    pub(super) fn name_residues(&mut self, mut names: Vec<(&str, Kind, u64)>) {
+    /// Sets the total and the counts of kinds, residue names and atoms of files that were not read.
+    pub(super) fn finish(&mut self, mut names: Vec<(&str, Kind, u64)>, unread: Unread) {
+        (self.other_blocks, self.spheres) = (unread.blocks, unread.spheres);
         names.sort_unstable_by(|(a, i, m), (b, j, n)| n.cmp(m).then(a.cmp(b)).then(i.cmp(j)));
         let mut kinds: BTreeMap<Kind, u64> = BTreeMap::new();
         for (_, kind, n) in &names {
             *kinds.entry(*kind).or_default() += n;
         }
-        self.kinds = kinds.into_iter().collect();
-        self.kinds.sort_by_key(|(_, n)| std::cmp::Reverse(*n));
+        self.kinds = kinds.into_iter().map(|(kind, atoms)| KindCount { kind: kind.name(), atoms }).collect();
+        self.kinds.sort_by_key(|kind| std::cmp::Reverse(kind.atoms));
         let shown = names.len().min(MAX_NAMES);
         self.other_residues = names[shown..].iter().map(|(.., n)| n).sum();
-        self.residues = names[..shown].iter().map(|(name, kind, n)| ((*name).to_owned(), *kind, *n)).collect();
+        let residue =
+            |&(name, kind, atoms): &(&str, Kind, u64)| ResidueCount { name: name.to_owned(), kind: kind.name(), atoms };
+        self.residues = names[..shown].iter().map(residue).collect();
+        self.total = self.sum();
     }
 }
 

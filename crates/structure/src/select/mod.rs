@@ -17,8 +17,8 @@ pub use blocks::{SelectedBlocks, SelectedOfBlock};
 pub use context::Context;
 use evaluate::{Evaluation, Marks};
 pub use expression::Expression;
-pub use left_out::LeftOut;
 use left_out::Tally;
+pub use left_out::{KindCount, LeftOut, ResidueCount};
 use molmesh_surface::Control;
 pub use parse::{BadExpression, MAX_DEPTH, MAX_DISTANCE, MAX_WITHIN};
 pub use selected::Selected;
@@ -129,8 +129,7 @@ pub fn select_with(
         return Err(StructureError::EmptySelection { holds: holds(structure, selection, model) });
     }
     let texts: Vec<&str> = structure.residue.texts().collect();
-    left_out.name_residues(residues.named(&texts).collect());
-    left_out.add_unread(structure.unread);
+    left_out.finish(residues.named(&texts).collect(), structure.unread);
     let selected =
         Selected { n_distinct: atoms.len(), atoms, marks, copies: Vec::new(), units: Vec::new(), model, left_out };
     match assembly {

@@ -13,7 +13,7 @@ use molmesh_surface::{Control, Exceeded, Limit, MemoryMeter as _, Reservation};
 use rayon::prelude::*;
 
 use crate::altloc::ATOMS_PER_CHECK;
-use crate::read::{ReadLimits, check};
+use crate::read::{ReadLimits, check, check_every};
 use crate::{Structure, StructureError};
 
 type Point = [f64; 3];
@@ -174,9 +174,7 @@ impl PointGrid {
         let atoms = || rows.clone().filter(|&i| is_of(i)).map(|i| position(structure, i));
         let (mut all, mut n_points) = (PointBox::NONE, 0_usize);
         for point in atoms() {
-            if n_points % ATOMS_PER_CHECK == 0 {
-                check(control)?;
-            }
+            check_every(control, n_points, ATOMS_PER_CHECK)?;
             all.add(point);
             n_points += 1;
         }
@@ -205,9 +203,7 @@ impl PointGrid {
         };
         let (mut counts, mut n_slots) = (GroupCounts::new(0), 0);
         for (n, point) in atoms().enumerate() {
-            if n % ATOMS_PER_CHECK == 0 {
-                check(control)?;
-            }
+            check_every(control, n, ATOMS_PER_CHECK)?;
             let index = grid.index(grid.cell_of(point));
             if grid.slots[index] == 0 {
                 grid.bounds.push(PointBox::NONE);
@@ -221,9 +217,7 @@ impl PointGrid {
         }
         grid.points = counts.groups();
         for (n, point) in atoms().enumerate() {
-            if n % ATOMS_PER_CHECK == 0 {
-                check(control)?;
-            }
+            check_every(control, n, ATOMS_PER_CHECK)?;
             let slot = grid.slots[grid.index(grid.cell_of(point))] as usize - 1;
             grid.points.push(slot, point);
         }

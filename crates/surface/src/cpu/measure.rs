@@ -55,7 +55,7 @@ impl SheetSums {
         self.bricks.push(BrickSheets { first: to_u32(first), n, near, far });
         if n == 1 {
             let vertices = around[0].map_or(0, |own| to_u32(own.t.len()));
-            self.sheets.push(Sheet { origin, vertices, above: table.shared(), ..sum(table, table.corners()) });
+            self.sheets.push(Sheet { origin, vertices, above: table.shared, ..sum(table, table.corners()) });
             return;
         }
         self.sheets.resize(first + usize::from(n), Sheet { origin, ..Sheet::default() });

@@ -40,14 +40,13 @@ use self::first_pass::Pass;
 pub(super) use self::interpolate::MAX_SHARE;
 use self::neighbours::NumberedBrick;
 use self::scan::Totals;
-use super::backend::{Backend, GridStats, MeshOutput};
+use super::backend::{Backend, BackendJob, GridStats, MeshOutput};
 use super::control::{Control, Stage};
 use super::error::SurfaceError;
 use super::kernel::Shape;
 use super::lattice::{Lattice, TILE, to_f32, to_u32};
 use super::params::{SurfaceLimits, SurfaceParams};
 use super::quantize::Step;
-use super::sink::MeshSink;
 use super::spheres::Spheres;
 use super::{candidates, occupancy, simd, threads};
 
@@ -104,14 +103,8 @@ impl Backend for CpuBackend {
         format!("native CPU, {threads} thread{plural}, {}", simd::extension())
     }
 
-    fn write(
-        &self,
-        spheres: &Spheres,
-        params: &SurfaceParams,
-        limits: &SurfaceLimits,
-        control: &Control<'_>,
-        sink: Option<&dyn MeshSink>,
-    ) -> Result<MeshOutput, SurfaceError> {
+    fn write(&self, job: &BackendJob<'_>) -> Result<MeshOutput, SurfaceError> {
+        let BackendJob { spheres, params, limits, control, sink } = *job;
         self.install(|free_threads| {
             // Only the mesh outlives the run.
             let context = RunContext { params, limits, control: &control.metered(), free_threads };

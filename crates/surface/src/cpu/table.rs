@@ -31,7 +31,7 @@ pub(super) struct BrickTable {
     /// Triangles.
     pub(super) triangles: usize,
     /// Neighbours that hold vertices of the brick's triangles: bit n for neighbour n.
-    shared: u8,
+    pub(super) shared: u8,
 }
 
 /// Allocates a table on the heap, without a copy on the stack.
@@ -177,11 +177,6 @@ impl BrickTable {
     /// Corners of the brick's triangles as grid edges.
     pub(super) fn corners(&self) -> &[[u16; 3]] {
         &self.corners.as_chunks::<3>().0[..self.triangles]
-    }
-
-    /// The neighbours (bit n for neighbour n) that hold vertices of the brick's triangles.
-    pub(super) fn shared(&self) -> u8 {
-        self.shared
     }
 
     /// Returns a vertex's position in spacings from the brick's first grid point.

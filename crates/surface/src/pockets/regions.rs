@@ -67,9 +67,7 @@ impl Regions {
         let ny = set.size[1];
         let mut joined = UnionFind::new(found.runs.len());
         for (i, (run, _)) in found.runs.iter().enumerate() {
-            if i % RUNS == 0 {
-                control.check()?;
-            }
+            control.check_every(i, RUNS)?;
             let row = run.row as usize;
             let (y, z) = (row % ny, row / ny);
             let before = (z > 0).then(|| (y.saturating_sub(1)..(y + 2).min(ny)).map(|y| (z - 1) * ny + y));
@@ -268,9 +266,7 @@ fn depth2(points: &[[i32; 3]], entrances: &[[i32; 3]], control: &Control<'_>) ->
         return Ok(0);
     }
     for (i, point) in points.iter().enumerate() {
-        if i % POINTS_PER_CHECK == 0 {
-            control.check()?;
-        }
+        control.check_every(i, POINTS_PER_CHECK)?;
         let mut nearest = (u64::MAX, start);
         for step in 0..2 * entrances.len() {
             // Both directions in turn: start, start + 1, start − 1, …

@@ -336,9 +336,7 @@ fn join_ends(
     let _memory = control.reserve(4 * size_of::<([f64; 3], u32, u32)>() as u64 * arcs.len() as u64)?;
     let cell = |x: [f64; 3]| x.map(|c| to_i32((c / side).floor()));
     for (n, arc) in (0_u32..).zip(arcs) {
-        if (n as usize).is_multiple_of(PER_CHECK) {
-            control.check()?;
-        }
+        control.check_every(n as usize, PER_CHECK)?;
         let atom = &atoms[arc.spheres[0] as usize];
         let [from, to, _] = arc.points();
         for end in [from, to] {

@@ -171,9 +171,7 @@ impl ExactMeasures {
         control.memory.grow((size_of::<LatticeAtom>() * spheres.len()) as u64)?;
         let mut atoms = Vec::with_capacity(spheres.len());
         for i in 0..spheres.len() {
-            if i.is_multiple_of(PER_CHECK) {
-                control.check()?;
-            }
+            control.check_every(i, PER_CHECK)?;
             let length = effective_radius(spheres.radius(i), params) + enlarged;
             atoms.push(on_lattice(spheres.centre(i), length, i));
         }
