@@ -130,7 +130,7 @@ async fn store(app: &Shared) -> ReadinessCheck {
 }
 
 fn broker(app: &Shared) -> ReadinessCheck {
-    let found = match app.job_store.broker_down() {
+    let found = match app.job_store.broker().down() {
         None => Ok("jobs can be dispatched".to_owned()),
         Some(why) => Err(format!("jobs cannot be dispatched: {why}")),
     };

@@ -300,7 +300,7 @@ pub(super) fn document(view: &JobView) -> JobDocument {
         created: rfc3339(record.created_ms),
         started: record.started_ms.map(rfc3339),
         finished: record.finished_ms.map(rfc3339),
-        structure: record.input.clone(),
+        structure: record.input.to_string(),
         format: record.format.clone(),
         parameters,
         problem: problem(record),

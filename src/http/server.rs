@@ -267,10 +267,10 @@ async fn dispatch_jobs(jobs: JobStore, claims: bool) {
         jobs.start_claiming();
     }
     loop {
-        while jobs.broker_down().is_some() {
+        while jobs.broker().down().is_some() {
             tokio::time::sleep(BROKER_CHECK).await;
         }
-        let losses = jobs.broker_losses();
+        let losses = jobs.broker().losses();
         let pause = match jobs.reconcile().await {
             Ok(0) => RECONCILE,
             Ok(dispatched) => {
@@ -284,7 +284,7 @@ async fn dispatch_jobs(jobs: JobStore, claims: bool) {
             }
         };
         let end = tokio::time::Instant::now() + pause;
-        let may_lack_jobs = || jobs.broker_down().is_some() || jobs.broker_losses() != losses;
+        let may_lack_jobs = || jobs.broker().down().is_some() || jobs.broker().losses() != losses;
         while tokio::time::Instant::now() < end && !may_lack_jobs() {
             tokio::time::sleep(BROKER_CHECK).await;
         }

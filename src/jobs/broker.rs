@@ -48,21 +48,25 @@ impl Dispatch {
     }
 }
 
+/// Progress of a running job.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(crate) struct JobProgress {
+    /// Number of attempts.
+    pub(crate) attempts: u32,
+    /// Start of the attempt, ms since 1970.
+    pub(crate) started_ms: Option<u64>,
+    /// Stage.
+    pub(crate) stage: Cow<'static, str>,
+    /// Finished fraction, from 0 to 1.
+    pub(crate) fraction: f64,
+}
+
 /// News of a job, published by the node that runs or cancels it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub(crate) enum JobEvent {
     /// The job runs.
-    Running {
-        /// Number of attempts.
-        attempts: u32,
-        /// Start of the attempt, ms since 1970.
-        started_ms: Option<u64>,
-        /// Stage.
-        stage: Cow<'static, str>,
-        /// Finished fraction, from 0 to 1.
-        fraction: f64,
-    },
+    Running(JobProgress),
     /// The end of the job is on record.
     Ended,
 }
@@ -132,17 +136,19 @@ impl Drop for WorkLock {
     }
 }
 
-/// Ways to end a claim.
-pub(crate) trait Lease: Send + Sync {
-    /// Removes the job from the queue.
-    fn done(self: Box<Self>) -> BoxFuture<'static, ()>;
-
-    /// Returns the job to the queue. It can be claimed again after `delay`.
-    fn release(self: Box<Self>, delay: Duration);
-
-    /// Ends the claim after another worker has claimed the job.
-    fn abandon(self: Box<Self>);
+/// End of a claim.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum ClaimEnd {
+    /// The job leaves the queue.
+    Done,
+    /// The job returns to the queue, and can be claimed again after this time.
+    Release(Duration),
+    /// Another worker has claimed the job meanwhile.
+    Abandon,
 }
+
+/// Ends a claim. Only the future of [`ClaimEnd::Done`] has to be polled.
+type EndClaim = Box<dyn FnOnce(ClaimEnd) -> BoxFuture<'static, ()> + Send + Sync>;
 
 /// Claimed job. No other worker gets the job until the claim ends, or until its node has not extended it for a lease. A
 /// claim that is dropped returns the job to the queue.
@@ -150,7 +156,7 @@ pub(crate) trait Lease: Send + Sync {
 pub(crate) struct Claim {
     /// Id of the job.
     pub(crate) id: JobId,
-    lease: Option<Box<dyn Lease>>,
+    end: Option<EndClaim>,
 }
 
 impl fmt::Debug for Claim {
@@ -160,36 +166,22 @@ impl fmt::Debug for Claim {
 }
 
 impl Claim {
-    fn new(id: JobId, lease: impl Lease + 'static) -> Self {
-        Self { id, lease: Some(Box::new(lease)) }
+    fn new(id: JobId, end: impl FnOnce(ClaimEnd) -> BoxFuture<'static, ()> + Send + Sync + 'static) -> Self {
+        Self { id, end: Some(Box::new(end)) }
     }
 
-    /// Leaves the job to another worker that has claimed it meanwhile.
-    pub(crate) fn abandon(mut self) {
-        if let Some(lease) = self.lease.take() {
-            lease.abandon();
-        }
-    }
-
-    /// Removes the job from the queue.
-    pub(crate) async fn done(mut self) {
-        if let Some(lease) = self.lease.take() {
-            lease.done().await;
-        }
-    }
-
-    /// Returns the job to the queue. It can be claimed again after `delay`.
-    pub(crate) fn release(mut self, delay: Duration) {
-        if let Some(lease) = self.lease.take() {
-            lease.release(delay);
+    /// Ends the claim.
+    pub(crate) async fn end(mut self, end: ClaimEnd) {
+        if let Some(finish) = self.end.take() {
+            finish(end).await;
         }
     }
 }
 
 impl Drop for Claim {
     fn drop(&mut self) {
-        if let Some(lease) = self.lease.take() {
-            lease.release(Duration::ZERO);
+        if let Some(finish) = self.end.take() {
+            drop(finish(ClaimEnd::Release(Duration::ZERO)));
         }
     }
 }

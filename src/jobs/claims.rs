@@ -6,16 +6,16 @@ use std::time::Duration;
 use futures_util::StreamExt as _;
 use tokio::sync::OwnedSemaphorePermit;
 
-use super::broker::{Claim, Dispatch, JobEvent};
+use super::broker::{Broker, Claim, ClaimEnd, Dispatch, JobEvent};
 use super::durable_job::DurableJob;
 use super::job_store::JobStore;
 use super::rank::Lane;
 use super::record::{JobRecord, Status};
 use super::retry;
 use super::runner::Runner;
-use super::runs::RunResult;
-use super::{EndError, Refusal, Task};
-use crate::store::{Digest, StoreError};
+use super::runs::{Phase, RunEnd};
+use super::{Refusal, Task};
+use crate::store::StoreError;
 use crate::sync::{Handle, sleep};
 
 /// Interval at which the record of a followed job is read. Events arrive sooner, but may be lost.
@@ -28,14 +28,9 @@ const DUPLICATE: Duration = Duration::from_secs(5);
 const OTHER_RELEASE: Duration = Duration::from_secs(5);
 
 impl JobStore {
-    /// Returns how often the broker may have lost jobs, which [`Self::reconcile`] dispatches again.
-    pub(crate) fn broker_losses(&self) -> usize {
-        self.0.broker.losses()
-    }
-
-    /// Returns the reason for which no job can be dispatched or claimed now, if there is one.
-    pub(crate) fn broker_down(&self) -> Option<String> {
-        self.0.broker.down()
+    /// Returns the broker. [`Self::reconcile`] dispatches jobs that it has lost again.
+    pub(crate) fn broker(&self) -> &dyn Broker {
+        self.0.broker.as_ref()
     }
 
     /// Dispatches an accepted job. If that fails, [`Self::reconcile`] dispatches it later.
@@ -69,81 +64,54 @@ impl JobStore {
             };
             let claimed = tokio::select! {
                 biased;
-                () = self.0.runs.finishing() => None,
+                () = self.0.runs.reached(Phase::Finish) => None,
                 claimed = next => claimed,
             };
             let Some((claim, slot)) = claimed else { return };
             let (jobs, run) = (self.clone(), self.count_run());
-            Handle::current().spawn(async move { run.end(jobs.run_claimed(claim, slot).await) });
+            Handle::current().spawn(async move {
+                let end = jobs.run_claimed(&claim, slot).await;
+                claim.end(end.claim).await;
+                run.end(end);
+            });
         }
     }
 
-    /// Starts the run of a claimed job unless it has ended or runs in this process already. Returns the result of the
-    /// claim, unless the run has its own.
-    async fn run_claimed(&self, claim: Claim, slot: OwnedSemaphorePermit) -> Option<RunResult> {
+    /// Runs a claimed job unless it has ended or runs in this process already.
+    async fn run_claimed(&self, claim: &Claim, slot: OwnedSemaphorePermit) -> RunEnd {
         let record = tokio::select! {
             biased;
-            record = self.record_of(&claim) => record,
-            () = self.0.runs.returning() => {
-                claim.release(Duration::ZERO);
-                return Some(RunResult::Returned);
-            }
-        };
-        let record = match record {
-            Ok(Some(record)) => record,
-            Ok(None) => {
-                claim.done().await;
-                return None;
-            }
-            Err(FromOtherRelease) => {
-                claim.release(OTHER_RELEASE);
-                return None;
-            }
+            record = self.record_of(claim) => match record {
+                Ok(record) => record,
+                Err(end) => return RunEnd::unused(end),
+            },
+            () = self.0.runs.reached(Phase::Return) => return RunEnd::returned(Duration::ZERO, true),
         };
         let job = self.insert_open(record.clone());
         if job.ended().is_some() {
             // Its end could not be written before.
-            return Some(match self.0.write_job(&job).await {
-                Ok(()) => {
-                    claim.done().await;
-                    RunResult::Finished
-                }
-                Err(error) => {
-                    tracing::error!(job_id = %job.id(), %error, "cannot record the end of a job");
-                    claim.release(DUPLICATE);
-                    RunResult::Unrecorded
-                }
-            });
+            let Err(error) = self.0.write_job(&job).await else { return RunEnd::done(true) };
+            tracing::error!(job_id = %job.id(), %error, "cannot record the end of a job");
+            return RunEnd::returned(DUPLICATE, false);
         }
-        if !self.0.try_own(&job) {
-            claim.release(DUPLICATE);
-            return None;
-        }
-        job.adopt(record.clone());
-        match self.0.track(&record) {
-            Ok(digest) => {
-                self.spawn(Runner { job, digest, ticket: None, claim: Some(claim), slot: Some(slot) });
-                None
-            }
-            Err(error) => {
-                let recorded = self.finish(&job, Err(error)).await;
-                job.release();
-                claim.done().await;
-                Some(if recorded { RunResult::Finished } else { RunResult::Unrecorded })
-            }
-        }
+        let owned = self.0.lock().own(&job);
+        let Some(owned) = owned else { return RunEnd::unused(ClaimEnd::Release(DUPLICATE)) };
+        self.0.track(&record);
+        job.adopt(record);
+        Runner { jobs: self.clone(), owned, ticket: None, slot: Some(slot) }.run().await
     }
 
-    /// Reads the record of a claimed job; `None` if no such job is open. Waits while the store fails.
-    async fn record_of(&self, claim: &Claim) -> Result<Option<JobRecord>, FromOtherRelease> {
+    /// Reads the record of a claimed job; the end of the claim if there is no such job for this release. Waits while
+    /// the store fails.
+    async fn record_of(&self, claim: &Claim) -> Result<JobRecord, ClaimEnd> {
         let mut pause = retry::FIRST_PAUSE;
         loop {
             match self.0.read(&claim.id).await {
-                Ok(Some(record)) if record.status.is_final() => return Ok(None),
-                Ok(Some(record)) if record.request().is_err() => return Err(FromOtherRelease),
-                Ok(record) => return Ok(record),
-                Err(StoreError::Quarantined { .. }) => return Ok(None),
-                Err(StoreError::OtherRelease { .. }) => return Err(FromOtherRelease),
+                Ok(Some(record)) if record.status.is_final() => return Err(ClaimEnd::Done),
+                Ok(Some(record)) if record.request().is_err() => return Err(ClaimEnd::Release(OTHER_RELEASE)),
+                Ok(record) => return record.ok_or(ClaimEnd::Done),
+                Err(StoreError::Quarantined { .. }) => return Err(ClaimEnd::Done),
+                Err(StoreError::OtherRelease { .. }) => return Err(ClaimEnd::Release(OTHER_RELEASE)),
                 Err(error) => tracing::warn!(job_id = %claim.id, %error, "a claimed job waits for the store"),
             }
             sleep(pause).await;
@@ -153,8 +121,8 @@ impl JobStore {
 
     /// Adds an unfinished job to the map, unless it is there, and returns the job in the map.
     pub(super) fn insert_open(&self, record: JobRecord) -> Arc<DurableJob> {
-        let (id, fresh) = (record.id.clone(), Arc::new(DurableJob::new(record)));
-        let job = self.0.insert(&id, &fresh);
+        let fresh = Arc::new(DurableJob::new(record));
+        let job = self.0.lock().insert(&fresh);
         if Arc::ptr_eq(&job, &fresh) {
             Handle::current().spawn(self.clone().follow(fresh));
         }
@@ -177,17 +145,17 @@ impl JobStore {
             stale = tokio::select! {
                 Some(event) = events.next() => match event {
                     JobEvent::Ended => true,
-                    JobEvent::Running { attempts, .. } if job.is_owned() => {
+                    JobEvent::Running(progress) if job.is_owned() => {
                         // An attempt that returned to the queue does not count any more.
                         let own = job.record();
-                        if own.status == Status::Running && attempts > own.attempts {
+                        if own.status == Status::Running && progress.attempts > own.attempts {
                             tracing::warn!(job_id = %id, "another worker runs a later attempt of a job");
-                            job.stop().notify_one();
+                            job.stop();
                         }
                         false
                     }
-                    JobEvent::Running { attempts, started_ms, stage, fraction } => {
-                        job.publish_stage((attempts, started_ms), stage, fraction);
+                    JobEvent::Running(progress) => {
+                        job.publish_progress(&progress);
                         false
                     }
                 },
@@ -212,9 +180,9 @@ impl JobStore {
         match self.0.read(&id).await {
             Ok(Some(record)) if record.status.is_final() => {
                 job.publish_end(record);
-                self.0.open.remove(&id);
+                self.0.close(&id);
                 if job.is_owned() {
-                    job.stop().notify_one();
+                    job.stop();
                     // Removes the open record, which the runner may have written after the end of the job.
                     if let Err(error) = self.0.write_job(job).await {
                         tracing::debug!(job_id = %id, %error, "the open record of an ended job is removed later");
@@ -235,7 +203,7 @@ impl JobStore {
             Err(StoreError::OtherRelease { .. }) => {
                 // A node of that release has taken the job over.
                 self.0.lock().jobs.remove(&id);
-                job.stop().notify_one();
+                job.stop();
                 true
             }
             Err(error) => {
@@ -246,19 +214,7 @@ impl JobStore {
     }
 }
 
-/// Error of a claimed job whose record another release wrote, or whose parameters this release does not know.
-struct FromOtherRelease;
-
 /// Returns true if only the task that follows a job uses it.
 fn is_unused(job: &DurableJob) -> bool {
     job.state.receiver_count() <= 1 && !job.is_owned()
-}
-
-/// Returns the digest of the input of a record.
-pub(super) fn input_of(record: &JobRecord) -> Result<(Digest, Option<Digest>), EndError> {
-    let map = record.map.as_deref().map(str::parse::<Digest>).transpose();
-    match (record.input.parse::<Digest>(), map) {
-        (Ok(input), Ok(map)) => Ok((input, map)),
-        _ => Err(EndError::Lost { why: "its input or its map has no valid digest".to_owned() }),
-    }
 }

@@ -1,23 +1,46 @@
 //! One durable job from its acceptance to its end, and the state that its watchers see.
 
-use std::borrow::Cow;
-use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use tokio::sync::{Notify, watch};
 
+use super::broker::JobProgress;
 use super::job_store::JobView;
 use super::record::{JobId, JobRecord, Status, now_ms};
 
 /// A job whose record is in the store.
 pub(super) struct DurableJob {
     pub(super) state: watch::Sender<JobView>,
-    /// Signals the runner to stop the work: the job has ended, or a later attempt runs in another process.
-    stop: Mutex<Arc<Notify>>,
     /// Held while the record is written.
     pub(super) writing: tokio::sync::Mutex<()>,
-    /// True while a [`Runner`](super::runner::Runner) of this process runs the job.
-    owned: AtomicBool,
+    /// Signal that stops the runner of this process: the job has ended, or a later attempt runs in another process.
+    /// `None` while there is no runner.
+    stop: Mutex<Option<Arc<Notify>>>,
+}
+
+/// Ownership of a job by its runner in this process, until it is dropped.
+pub(super) struct Ownership {
+    pub(super) job: Arc<DurableJob>,
+    /// Signal to stop the work.
+    pub(super) stop: Arc<Notify>,
+}
+
+impl Ownership {
+    /// Makes the caller the runner of a job. `None` if it has one in this process.
+    pub(super) fn take(job: &Arc<DurableJob>) -> Option<Self> {
+        let mut signal = job.signal();
+        if signal.is_some() {
+            return None;
+        }
+        let stop = Arc::clone(signal.insert(Arc::default()));
+        Some(Self { job: Arc::clone(job), stop })
+    }
+}
+
+impl Drop for Ownership {
+    fn drop(&mut self) {
+        *self.job.signal() = None;
+    }
 }
 
 impl DurableJob {
@@ -25,34 +48,22 @@ impl DurableJob {
         let fraction = if record.status == Status::Successful { 1.0 } else { 0.0 };
         // Later than every version of an earlier process, unless the job has ended.
         let version = record.finished_ms.unwrap_or_else(now_ms);
-        let (state, _) = watch::channel(JobView { record, stage: None, fraction, version, end: None });
-        let (stop, writing) = (Mutex::default(), tokio::sync::Mutex::default());
-        Self { state, stop, writing, owned: AtomicBool::new(false) }
+        let state = watch::Sender::new(JobView { record, stage: None, fraction, version, end: None });
+        Self { state, writing: tokio::sync::Mutex::default(), stop: Mutex::default() }
     }
 
-    /// Makes the caller the runner of the job. Returns false if it has one in this process.
-    pub(super) fn try_own(&self) -> bool {
-        let is_new = !self.owned.swap(true, Ordering::AcqRel);
-        if is_new {
-            // A signal to an earlier runner does not stop this one.
-            *self.stop.lock().unwrap_or_else(PoisonError::into_inner) = Arc::default();
-        }
-        is_new
+    fn signal(&self) -> MutexGuard<'_, Option<Arc<Notify>>> {
+        self.stop.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Returns the signal to stop the work of the present runner.
-    pub(super) fn stop(&self) -> Arc<Notify> {
-        Arc::clone(&self.stop.lock().unwrap_or_else(PoisonError::into_inner))
-    }
-
-    /// Ends the ownership of the runner.
-    pub(super) fn release(&self) {
-        self.owned.store(false, Ordering::Release);
+    /// Stops the work of the runner of this process, if there is one.
+    pub(super) fn stop(&self) {
+        self.signal().iter().for_each(|stop| stop.notify_one());
     }
 
     /// Returns true while a runner of this process runs the job.
     pub(super) fn is_owned(&self) -> bool {
-        self.owned.load(Ordering::Acquire)
+        self.signal().is_some()
     }
 
     pub(super) fn id(&self) -> JobId {
@@ -103,15 +114,15 @@ impl DurableJob {
         })
     }
 
-    /// Marks the job as accepted again, with `attempts` attempts, and `memory_waits` more that lacked memory. Returns
-    /// true if that changed the record.
-    pub(super) fn return_to_queue(&self, attempts: u32, memory_waits: u32) -> bool {
+    /// Marks the job as accepted again, with `attempts` attempts, and perhaps one more that lacked memory. Returns true
+    /// if that changed the record.
+    pub(super) fn return_to_queue(&self, attempts: u32, lacked_memory: bool) -> bool {
         self.update(|view, _| {
-            if view.record.attempts == attempts && view.record.started_ms.is_none() && memory_waits == 0 {
+            if view.record.attempts == attempts && view.record.started_ms.is_none() && !lacked_memory {
                 return false;
             }
             view.record.attempts = attempts;
-            view.record.memory_waits += memory_waits;
+            view.record.memory_waits += u32::from(lacked_memory);
             view.record.status = Status::Accepted;
             view.record.started_ms = None;
             view.stage = None;
@@ -171,26 +182,21 @@ impl DurableJob {
         });
     }
 
-    /// Publishes the stage and the finished fraction of attempt `attempts` if they have advanced. Returns true if they
-    /// have.
-    pub(super) fn publish_stage(
-        &self,
-        (attempts, started_ms): (u32, Option<u64>),
-        stage: Cow<'static, str>,
-        fraction: f64,
-    ) -> bool {
+    /// Publishes the progress of an attempt if it has advanced. Returns true if it has.
+    pub(super) fn publish_progress(&self, progress: &JobProgress) -> bool {
+        let JobProgress { attempts, started_ms, stage, fraction } = progress;
         self.update(|view, now| {
-            let begins = view.record.status == Status::Accepted || view.record.attempts < attempts;
-            if !begins && view.stage.as_ref() == Some(&stage) && fraction <= view.fraction + 0.004 {
+            let begins = view.record.status == Status::Accepted || view.record.attempts < *attempts;
+            if !begins && view.stage.as_ref() == Some(stage) && *fraction <= view.fraction + 0.004 {
                 return false;
             }
             if begins {
-                view.record.attempts = view.record.attempts.max(attempts);
+                view.record.attempts = view.record.attempts.max(*attempts);
                 view.record.status = Status::Running;
                 view.record.started_ms = started_ms.or(Some(now));
             }
-            view.stage = Some(stage);
-            view.fraction = view.fraction.max(fraction);
+            view.stage = Some(stage.clone());
+            view.fraction = view.fraction.max(*fraction);
             true
         })
     }

@@ -81,6 +81,13 @@ pub(crate) enum Failure {
     Panicked { message: String },
 }
 
+impl Failure {
+    /// Returns true if the work was cancelled.
+    pub(super) const fn is_cancelled(&self) -> bool {
+        matches!(self, Self::Job { error: JobError::Surface(SurfaceError::Cancelled), .. })
+    }
+}
+
 impl From<JobError> for Failure {
     fn from(error: JobError) -> Self {
         match error {

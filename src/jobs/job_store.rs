@@ -6,7 +6,6 @@
 //! contents, so computing one twice is harmless; a crash costs time and never loses a job.
 
 use std::borrow::Cow;
-use std::collections::HashMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
@@ -17,10 +16,9 @@ use tracing::Instrument as _;
 
 use super::broker::{Broker, Dispatch};
 use super::durable_job::DurableJob;
-use super::open_jobs::OpenJobs;
+use super::job_map::JobMap;
 use super::record::{JobId, JobRecord, Requester, Status, now_ms};
 use super::records::existing;
-use super::retry::retry;
 use super::runner::Runner;
 use super::runs::Runs;
 use super::{AcceptError, ContentKey, EndError, OnStart, Pool, SaveError, Task, Ticket, results};
@@ -31,9 +29,6 @@ use crate::single_flight::SingleFlight;
 use crate::store::{Digest, Namespace, Pin, Secret, Store, StoreError};
 use crate::sync::{Handle, timeout};
 
-/// Number of ended jobs that are held in memory; older ones are read from the store. A record takes up to 64 KiB, the
-/// size of a request without its structure.
-pub(super) const MAX_ENDED: usize = 256;
 /// Maximum time that the acceptance of a job whose result is stored waits for its end to be recorded.
 const STORED_WAIT: Duration = Duration::from_secs(5);
 /// Number of records of begun and ended jobs that are written concurrently, so that others find a free thread.
@@ -89,10 +84,8 @@ pub(super) struct JobStoreState {
     pub(super) describe: DescribeError,
     /// Secret that derives job ids from idempotency keys.
     secret: Secret,
-    /// Jobs that run in this process, are watched, or have ended recently.
+    /// Jobs that this process knows of.
     jobs: Mutex<JobMap>,
-    /// Unfinished jobs that this process knows of.
-    pub(super) open: OpenJobs,
     /// True once the records of earlier processes were read.
     pub(super) records_read: watch::Sender<bool>,
     /// Permits to write the record of a begun or ended job.
@@ -103,13 +96,6 @@ pub(super) struct JobStoreState {
     pub(super) saves: SingleFlight<ContentKey, Result<(), SaveError>>,
     /// Claims and runners of jobs.
     pub(super) runs: Runs,
-}
-
-/// Jobs by id.
-pub(super) struct JobMap {
-    pub(super) jobs: HashMap<JobId, Arc<DurableJob>>,
-    /// Number of jobs at which ended ones are removed.
-    trim_at: usize,
 }
 
 impl JobStoreState {
@@ -125,28 +111,6 @@ impl JobStoreState {
 
     pub(super) fn lock(&self) -> MutexGuard<'_, JobMap> {
         self.jobs.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-
-    /// Makes the caller the runner of a job. Returns false if the job has one, or is not in the map any more.
-    pub(super) fn try_own(&self, job: &Arc<DurableJob>) -> bool {
-        let map = self.lock();
-        map.jobs.get(&job.id()).is_some_and(|known| Arc::ptr_eq(known, job)) && job.try_own()
-    }
-
-    /// Adds a job to the map, unless there is one with this id, and returns the job in the map.
-    pub(super) fn insert(&self, id: &JobId, job: &Arc<DurableJob>) -> Arc<DurableJob> {
-        let mut map = self.lock();
-        let inserted = Arc::clone(map.jobs.entry(id.clone()).or_insert_with(|| Arc::clone(job)));
-        // Slack of 10 %, so that not every insertion sorts.
-        if map.jobs.len() > map.trim_at {
-            let mut ended: Vec<_> = map.jobs.values().filter_map(|job| job.ended()).collect();
-            ended.sort_unstable();
-            for (_, id) in ended.iter().take(ended.len().saturating_sub(MAX_ENDED)) {
-                map.jobs.remove(id);
-            }
-            map.trim_at = MAX_ENDED / 10 + map.jobs.len().max(MAX_ENDED);
-        }
-        inserted
     }
 }
 
@@ -171,8 +135,7 @@ impl JobStore {
             output_bytes,
             describe,
             secret,
-            jobs: Mutex::new(JobMap { jobs: HashMap::new(), trim_at: MAX_ENDED + MAX_ENDED / 10 }),
-            open: OpenJobs::default(),
+            jobs: Mutex::default(),
             records_read: watch::Sender::new(false),
             writes: Semaphore::new(CONCURRENT_WRITES),
             slots,
@@ -193,8 +156,8 @@ impl JobStore {
         let record = JobRecord {
             id: id.clone(),
             namespace,
-            input: spec.task.digest.to_string(),
-            map: spec.map.as_ref().map(|(digest, _)| digest.to_string()),
+            input: spec.task.digest,
+            map: spec.map.as_ref().map(|(digest, _)| *digest),
             parameters: spec.parameters,
             format: spec.format.name().to_owned(),
             client,
@@ -229,11 +192,10 @@ impl JobStore {
         if is_dispatched && inner.broker.queued() >= inner.broker.limit() {
             return Err(self.queue_full(&spec.task).into());
         }
-        let (digest, map) = (spec.task.digest, spec.map.as_ref().map(|(digest, _)| *digest));
         // Nothing of the job is evicted meanwhile.
-        let pins = inner.pins(&id, [digest].into_iter().chain(map), namespace)?;
+        let pins = inner.pins(&record);
         let reservation = inner.admit(&id).await?;
-        inner.store.put_input(&digest, namespace, spec.file).await?;
+        inner.store.put_input(&record.input, namespace, spec.file).await?;
         if let Some((digest, bytes)) = spec.map {
             inner.store.put_input(&digest, namespace, bytes).await?;
         }
@@ -245,16 +207,17 @@ impl JobStore {
         }
         drop(reservation);
         let dispatch = Dispatch::of(&record);
-        inner.open.insert(id.clone(), Some(dispatch.clone()), pins);
+        inner.open(id.clone(), Ok(dispatch.clone()), pins);
         if is_dispatched {
             self.dispatch(&dispatch).await;
-            let known = self.known(&id, namespace);
-            return Ok(known.map_or_else(|| DurableJob::new(record).view(), |job| job.view()));
+            let known = self.known(&id, namespace, |job| job.view());
+            return Ok(known.unwrap_or_else(|| DurableJob::new(record).view()));
         }
         let job = self.insert_open(record);
+        let owned = inner.lock().own(&job);
         // Otherwise the job was dispatched from its record and runs already.
-        if inner.try_own(&job) {
-            self.spawn(Runner { job: Arc::clone(&job), digest, ticket, claim: None, slot: None });
+        if let Some(owned) = owned {
+            Runner { jobs: self.clone(), owned, ticket, slot: None }.spawn();
         }
         if stored.is_some() {
             // The client gets the end at once, unless the store fails.
@@ -277,16 +240,10 @@ impl JobStore {
         Ok(None)
     }
 
-    /// Returns a job in memory, if it is of the namespace.
-    fn known(&self, id: &JobId, namespace: Namespace) -> Option<Arc<DurableJob>> {
-        self.0.lock().jobs.get(id).filter(|job| job.state.borrow().record.namespace == namespace).cloned()
-    }
-
-    /// Watches a job in memory, if it is of the namespace. The job stays in memory while it is watched.
-    fn watch_known(&self, id: &JobId, namespace: Namespace) -> Option<watch::Receiver<JobView>> {
-        let map = self.0.lock();
-        let job = map.jobs.get(id).filter(|job| job.state.borrow().record.namespace == namespace)?;
-        Some(job.state.subscribe())
+    /// Uses a job in memory, if it is of the namespace, under the lock of the map: it stays in memory while it is
+    /// watched.
+    fn known<T>(&self, id: &JobId, namespace: Namespace, job: impl FnOnce(&Arc<DurableJob>) -> T) -> Option<T> {
+        self.0.lock().jobs.get(id).filter(|job| job.state.borrow().record.namespace == namespace).map(job)
     }
 
     /// Watches the state of a job; `None` if the namespace has no such job.
@@ -295,12 +252,13 @@ impl JobStore {
         id: &JobId,
         namespace: Namespace,
     ) -> Result<Option<watch::Receiver<JobView>>, StoreError> {
-        if let Some(watched) = self.watch_known(id, namespace) {
+        let watch_known = || self.known(id, namespace, |job| job.state.subscribe());
+        if let Some(watched) = watch_known() {
             return Ok(Some(watched));
         }
         let record = self.0.read(id).await?.filter(|record| record.namespace == namespace);
         let Some(record) = record else { return Ok(None) };
-        if let Some(watched) = self.watch_known(id, namespace) {
+        if let Some(watched) = watch_known() {
             // The job began during the read. Its end may be on record and not be visible to others yet.
             return Ok(Some(watched));
         }
@@ -321,9 +279,9 @@ impl JobStore {
         if self.watch(id, namespace).await?.is_none() {
             return Ok(None);
         }
-        let Some(job) = self.known(id, namespace) else { return self.view(id, namespace).await };
+        let Some(job) = self.known(id, namespace, Arc::clone) else { return self.view(id, namespace).await };
         if job.end(Status::Dismissed, |_| {}) {
-            job.stop().notify_one();
+            job.stop();
             let (inner, ended) = (Arc::clone(&self.0), Arc::clone(&job));
             let write = async move {
                 let written = inner.write_job(&ended).await;
@@ -370,8 +328,7 @@ impl JobStore {
         if !changed {
             return true;
         }
-        let write = || self.0.write_job(job);
-        let written = retry(&id, self.0.retry_time(), StoreError::is_temporary, write).await;
+        let written = self.0.write_job_until_stored(job).await;
         // Without the record a restart runs the job again: wasted work, but nothing is lost.
         if let Err(error) = &written {
             tracing::error!(job_id = %id, %error, "cannot record the end of a job");

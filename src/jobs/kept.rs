@@ -1,5 +1,6 @@
 //! Values of the cache of structures: structures, tilesets and their colours, each charged to the memory budget.
 
+use std::any::Any;
 use std::collections::{BTreeMap, HashMap, HashSet};
 use std::ops::Deref;
 use std::sync::Arc;
@@ -27,14 +28,8 @@ pub(super) struct Charged<T> {
     pub(super) atoms: f64,
     /// Memory of the value, bytes.
     pub(super) bytes: u64,
-    pub(super) _charge: Charge,
-}
-
-/// Charge of a value. The metric of the budget counts it only if the value is not kept.
-#[derive(Debug)]
-pub(super) enum Charge {
-    Kept { _buffers: Buffers },
-    Used { _reservation: Arc<MemoryReservation> },
+    /// Charge of the memory. The metric of the budget counts it only if the value is not kept.
+    pub(super) _charge: Result<Buffers, Arc<MemoryReservation>>,
 }
 
 /// A structure or a tileset that other requests may use as well. Clones share it.
@@ -57,11 +52,6 @@ impl<T> Clone for Shared<T> {
 impl<T> Shared<T> {
     pub(super) fn bytes(&self) -> u64 {
         self.0.bytes
-    }
-
-    /// Returns true if a request uses the value.
-    pub(super) fn is_used(&self) -> bool {
-        Arc::strong_count(&self.0) > 1
     }
 }
 
@@ -112,35 +102,33 @@ impl Input {
     }
 }
 
-/// Value of the cache.
+/// Value of the cache: a [`SharedStructure`], a [`SharedTileset`] or [`SharedColors`].
 #[derive(Debug, Clone)]
-pub(super) enum Kept {
-    Structure(SharedStructure),
-    Tileset(SharedTileset),
-    Colors(SharedColors),
+pub(super) struct Kept {
+    pub(super) bytes: u64,
+    value: Arc<dyn Any + Send + Sync>,
+}
+
+impl<T: Send + Sync + 'static> From<Shared<T>> for Kept {
+    fn from(shared: Shared<T>) -> Self {
+        Self { bytes: shared.bytes(), value: shared.0 }
+    }
 }
 
 impl Kept {
-    pub(super) fn bytes(&self) -> u64 {
-        match self {
-            Self::Structure(kept) => kept.bytes(),
-            Self::Tileset(kept) => kept.bytes(),
-            Self::Colors(kept) => kept.bytes(),
-        }
+    /// Returns the value if it has this type.
+    pub(super) fn get<T: Send + Sync + 'static>(&self) -> Option<Shared<T>> {
+        Arc::clone(&self.value).downcast().ok().map(Shared)
     }
 
     /// Returns true for a tileset with its atoms on disk.
     pub(super) fn is_streamed(&self) -> bool {
-        matches!(self, Self::Tileset(tileset) if tileset.is_streamed())
+        self.get().is_some_and(|tileset: SharedTileset| tileset.is_streamed())
     }
 
     /// Returns true if a request uses the value, or a cached tileset uses the structure.
     pub(super) fn is_used(&self) -> bool {
-        match self {
-            Self::Structure(kept) => kept.is_used(),
-            Self::Tileset(kept) => kept.is_used(),
-            Self::Colors(kept) => kept.is_used(),
-        }
+        Arc::strong_count(&self.value) > 1
     }
 }
 
@@ -163,7 +151,7 @@ impl CacheState {
     pub(super) fn insert(&mut self, key: CacheKey, value: Kept) {
         self.remove(&key);
         self.uses += 1;
-        self.bytes += value.bytes();
+        self.bytes += value.bytes;
         self.by_use.insert(self.uses, key);
         self.kept.insert(key, (self.uses, value));
     }
@@ -171,7 +159,7 @@ impl CacheState {
     pub(super) fn remove(&mut self, key: &CacheKey) -> Option<Kept> {
         let (used, value) = self.kept.remove(key)?;
         self.by_use.remove(&used);
-        self.bytes -= value.bytes();
+        self.bytes -= value.bytes;
         Some(value)
     }
 

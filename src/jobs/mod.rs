@@ -17,10 +17,10 @@ mod error;
 #[cfg(test)]
 #[cfg(feature = "shuttle")]
 mod interleavings;
+mod job_map;
 mod job_store;
 mod kept;
 mod key;
-mod open_jobs;
 mod pool;
 mod queue;
 mod rank;

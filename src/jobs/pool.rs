@@ -113,9 +113,8 @@ impl Pool {
     /// Accepts a task whose mesh must be finished within `allowed`, time in the queue included. `on_start` is called
     /// before the work starts, unless the task joins a running job.
     pub(crate) fn submit(&self, task: Task, allowed: Duration, on_start: Option<OnStart>) -> Result<Ticket, Refusal> {
-        let mode = mode(&task);
         let ticket = self.shared.queue.push(task, allowed, on_start)?;
-        count(mode, &ticket);
+        count(&ticket);
         Ok(ticket)
     }
 
@@ -128,9 +127,7 @@ impl Pool {
         on_start: &mut Option<OnStart>,
     ) -> Result<Option<Ticket>, Refusal> {
         let ticket = self.shared.queue.join(task, allowed, on_start)?;
-        if let Some(ticket) = &ticket {
-            count(mode(task), ticket);
-        }
+        ticket.iter().for_each(count);
         Ok(ticket)
     }
 
@@ -215,11 +212,8 @@ impl Pool {
     }
 }
 
-fn mode(task: &Task) -> &'static str {
-    if task.rank.batch { "async" } else { "sync" }
-}
-
-fn count(mode: &'static str, ticket: &Ticket) {
+fn count(ticket: &Ticket) {
+    let mode = if ticket.is_durable { "async" } else { "sync" };
     let dedup = if ticket.is_shared { "yes" } else { "no" };
     counter!(JOBS_SUBMITTED, "mode" => mode, "dedup" => dedup).increment(1);
 }

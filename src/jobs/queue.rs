@@ -13,7 +13,7 @@ use std::time::{Duration, Instant};
 
 use tokio::sync::Notify;
 
-use super::coalesced_job::{CoalescedJob, OnStart, Progress, QueuedTask, work_key};
+use super::coalesced_job::{CoalescedJob, OnStart, QueuedTask, work_key};
 use super::cost::WorkRate;
 use super::rank::{Lane, Shares};
 use super::{Outcome, Refusal, Task, Ticket};
@@ -59,12 +59,39 @@ impl QueueState {
         }
     }
 
-    /// Puts the job at an index into a lane, to be started. Returns a worker to be woken up.
-    fn enqueue(&mut self, at: usize, lane: Lane) -> Option<Arc<Condvar>> {
+    /// Puts the job at an index into a lane, to be started, and wakes up a worker.
+    fn enqueue(&mut self, at: usize, lane: Lane) {
         let job = &mut self.jobs[at];
         job.lane = lane;
         job.tag = self.shares[lane as usize].tag(job.rank.client, job.units);
-        self.idle_workers[lane as usize].pop()
+        self.idle_workers[lane as usize].pop().iter().for_each(|worker| worker.notify_one());
+    }
+
+    /// Creates the job of a task, which is not queued yet.
+    fn job(&mut self, task: &Task) -> CoalescedJob {
+        self.next_id += 1;
+        let units = pipeline::estimate_work(task.input.atoms(), &task.options);
+        let now = Instant::now();
+        // A durable job runs after its request was answered.
+        let kind = if task.rank.batch { SpanKind::Consumer } else { SpanKind::Internal };
+        CoalescedJob {
+            id: self.next_id,
+            work: work_key(task),
+            rank: task.rank,
+            lane: Lane::of(&task.rank, units),
+            units,
+            is_tile: task.options.tile.is_some(),
+            tag: 0.0,
+            accepted: now,
+            begun: None,
+            cancel: CancelToken::default(),
+            is_moving: false,
+            progress: Arc::default(),
+            span: TraceSpan::start(&task.parent, "job", kind, now),
+            outcome: Some(single_flight::channel().0),
+            on_start: Vec::new(),
+            task: None,
+        }
     }
 
     fn find(&self, id: u64) -> Option<usize> {
@@ -112,41 +139,13 @@ impl Queue {
         if let Some(ticket) = self.join_in(&mut state, &task, allowed, &mut on_start)? {
             return Ok(ticket);
         }
-        let id = state.next_id;
-        state.next_id += 1;
-        let units = pipeline::estimate_work(task.input.atoms(), &task.options);
-        let now = Instant::now();
-        let is_durable = task.rank.batch;
-        let (sender, outcome) = single_flight::channel();
-        let lane = Lane::of(&task.rank, units);
-        let (progress, span) = (Arc::new(Progress::default()), job_span(&task, now));
-        state.jobs.push(CoalescedJob {
-            id,
-            work: work_key(&task),
-            rank: task.rank,
-            lane,
-            units,
-            is_tile: task.options.tile.is_some(),
-            tag: 0.0,
-            accepted: now,
-            begun: None,
-            cancel: CancelToken::default(),
-            is_moving: false,
-            progress: Arc::clone(&progress),
-            span: span.clone(),
-            outcome: Some(sender),
-            on_start: on_start.into_iter().collect(),
-            task: Some(task),
-        });
-        let at = state.jobs.len() - 1;
-        let worker = state.enqueue(at, lane);
+        let mut job = state.job(&task);
+        let (ticket, at, lane) = (self.ticket(&job, allowed), state.jobs.len(), job.lane);
+        job.on_start.extend(on_start);
+        job.task = Some(task);
+        state.jobs.push(job);
+        state.enqueue(at, lane);
         self.publish(&mut state);
-        drop(state);
-        if let Some(worker) = worker {
-            worker.notify_one();
-        }
-        let mut ticket = self.ticket(id, lane, Some(outcome), (progress, span), allowed);
-        ticket.is_durable = is_durable;
         Ok(ticket)
     }
 
@@ -178,9 +177,8 @@ impl Queue {
             if state.jobs[at].rank.batch && !task.rank.batch {
                 state.jobs[at].rank.batch = false;
                 let lane = Lane::of(&task.rank, state.jobs[at].units);
-                let worker = if joined_running { None } else { state.enqueue(at, lane) };
-                if let Some(worker) = worker {
-                    worker.notify_one();
+                if !joined_running {
+                    state.enqueue(at, lane);
                 }
             }
             let job = &mut state.jobs[at];
@@ -190,17 +188,13 @@ impl Queue {
             if let Some(context) = &task.parent.context {
                 job.span.link(context.clone());
             }
-            let outcome = job.outcome.as_ref().map(ResultReceiver::of);
-            let (progress, span) = (Arc::clone(&job.progress), job.span.clone());
-            let mut ticket = self.ticket(job.id, job.lane, outcome, (progress, span), allowed);
+            let mut ticket = self.ticket(job, allowed);
             (ticket.is_durable, ticket.is_shared, ticket.joined_running) = (task.rank.batch, true, joined_running);
             return Ok(Some(ticket));
         }
         if state.leaving && task.rank.batch {
-            let id = state.next_id;
-            state.next_id += 1;
             // The next process runs the job. Without a sender the ticket ends as stopped.
-            return Ok(Some(self.ticket(id, Lane::Batch, None, (Arc::default(), job_span(task, now)), allowed)));
+            return Ok(Some(self.ticket(&CoalescedJob { outcome: None, ..state.job(task) }, allowed)));
         }
         // A broker has queued durable jobs; no more are claimed than there are workers.
         if task.rank.batch {
@@ -220,18 +214,21 @@ impl Queue {
         Ok(None)
     }
 
-    /// Creates the ticket of a job.
-    fn ticket(
-        self: &Arc<Self>,
-        job: u64,
-        lane: Lane,
-        outcome: Option<ResultReceiver<Outcome>>,
-        (progress, span): (Arc<Progress>, TraceSpan),
-        allowed: Duration,
-    ) -> Ticket {
-        let (queue, deadline) = (Arc::clone(self), Instant::now() + allowed);
-        let (is_durable, is_shared, joined_running) = (false, false, false);
-        Ticket { queue, job, lane, outcome, deadline, allowed, progress, span, is_durable, is_shared, joined_running }
+    /// Creates the ticket of the first request for a job.
+    fn ticket(self: &Arc<Self>, job: &CoalescedJob, allowed: Duration) -> Ticket {
+        Ticket {
+            queue: Arc::clone(self),
+            job: job.id,
+            lane: job.lane,
+            outcome: job.outcome.as_ref().map(ResultReceiver::of),
+            deadline: Instant::now() + allowed,
+            allowed,
+            progress: Arc::clone(&job.progress),
+            span: job.span.clone(),
+            is_durable: job.rank.batch,
+            is_shared: false,
+            joined_running: false,
+        }
     }
 
     /// Takes the next job of a lane; blocks until there is one. `None` once the queue is closed and the lane is empty.
@@ -369,11 +366,4 @@ impl Queue {
             notified.await;
         }
     }
-}
-
-/// Starts the span of a job, below that of the first request for it.
-fn job_span(task: &Task, start: Instant) -> TraceSpan {
-    // A durable job runs after its request was answered.
-    let kind = if task.rank.batch { SpanKind::Consumer } else { SpanKind::Internal };
-    TraceSpan::start(&task.parent, "job", kind, start)
 }

@@ -128,10 +128,10 @@ pub(crate) struct JobRecord {
     #[serde(default, skip_serializing_if = "Namespace::is_common")]
     pub(crate) namespace: Namespace,
     /// SHA-256 of the input.
-    pub(crate) input: String,
+    pub(crate) input: Digest,
     /// SHA-256 of the map that was sent beside the input.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub(crate) map: Option<String>,
+    pub(crate) map: Option<Digest>,
     /// Names and values of the parameters, as the client wrote them.
     pub(crate) parameters: Vec<(String, String)>,
     /// Mesh format, as a file name extension.
@@ -277,7 +277,7 @@ impl JobRecord {
         let pairs = self.parameters.iter().map(|(name, value)| (name, value));
         let request = params::parse_with(pairs, |_| Ok::<_, params::ParamError>(format));
         let mut request = request.map_err(|error| error.to_string())?;
-        request.options.map = self.map.clone().map(MapFile::not_loaded);
+        request.options.map = self.map.map(|digest| MapFile::not_loaded(digest.to_string()));
         Ok(request)
     }
 
@@ -289,7 +289,7 @@ impl JobRecord {
         };
         let same_parameters =
             || self.parameters == other.parameters || parsed(self).is_some_and(|own| parsed(other) == Some(own));
-        (&self.input, &self.map, &self.format) == (&other.input, &other.map, &other.format) && same_parameters()
+        (self.input, self.map, &self.format) == (other.input, other.map, &other.format) && same_parameters()
     }
 }
 
@@ -336,7 +336,7 @@ mod tests {
         JobRecord {
             id: JobId::random(&[0; 32], 1).unwrap(),
             namespace: Namespace::default(),
-            input: Digest::of(b"x").to_string(),
+            input: Digest::of(b"x"),
             map: None,
             parameters: parameters.iter().map(|(n, v)| ((*n).to_owned(), (*v).to_owned())).collect(),
             format: "glb".to_owned(),
@@ -364,7 +364,7 @@ mod tests {
         assert!(a.is_same_request(&b));
         assert!(!a.is_same_request(&record(&[("resolution", "0.71"), ("atom_ids", "true")])));
         assert!(!a.is_same_request(&JobRecord { format: "stl".to_owned(), ..b.clone() }));
-        let mapped = |map: &str| JobRecord { map: Some(map.to_owned()), ..b.clone() };
+        let mapped = |map: &str| JobRecord { map: Some(Digest::of(map.as_bytes())), ..b.clone() };
         assert!(mapped("1").is_same_request(&mapped("1")));
         assert!(!mapped("1").is_same_request(&mapped("2")) && !mapped("1").is_same_request(&b));
         assert!(!record(&[("check", "strict")]).is_same_request(&record(&[])));

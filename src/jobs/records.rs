@@ -7,25 +7,21 @@
 //! A damaged record goes into quarantine. A record of another release stays as it is: a node of that release runs the
 //! job.
 
-use std::sync::Arc;
 use std::time::Duration;
 
 use bytes::Bytes;
 use futures_util::{StreamExt as _, stream};
 use metrics::counter;
-use thiserror::Error;
 
 use super::broker::{Dispatch, JobEvent};
-use super::claims::input_of;
 use super::durable_job::DurableJob;
 use super::job_store::{JobStore, JobStoreState};
 use super::rank::{Client, Rank};
 use super::record::{BadRecord, JobId, JobRecord};
-use super::{AcceptError, EndError, Input, JobView, Task};
+use super::retry::retry;
+use super::{AcceptError, Input, JobView, Task};
 use crate::formats::Format;
-use crate::pipeline::MapFile;
-use crate::store::{BadDigest, Digest, Name, Namespace, Pin, RecordCaps, RecordReservation, StoreError};
-use crate::surface::OutOfMemory;
+use crate::store::{Name, Pin, RecordReservation, StoreError};
 use crate::sync::timeout;
 use crate::telemetry::{JOBS_RECOVERED, shorten};
 
@@ -34,38 +30,39 @@ const CONCURRENT_READS: usize = 64;
 
 impl JobStoreState {
     /// Protects the inputs (structure and map) and the record of an unfinished job from eviction.
-    pub(super) fn pins(
-        &self,
-        id: &JobId,
-        inputs: impl IntoIterator<Item = Digest>,
-        space: Namespace,
-    ) -> Result<Vec<Pin>, StoreError> {
-        let mut pins = vec![self.store.pin(&Name::job(id.as_str())?)];
-        pins.extend(inputs.into_iter().map(|input| self.store.pin(&Name::input(&input).within(space))));
-        Ok(pins)
+    pub(super) fn pins(&self, record: &JobRecord) -> Vec<Pin> {
+        let inputs = [record.input].into_iter().chain(record.map);
+        let inputs = inputs.map(|input| Name::input(&input).within(record.namespace));
+        Name::job(record.id.as_str()).into_iter().chain(inputs).map(|name| self.store.pin(&name)).collect()
+    }
+
+    /// Adds an unfinished job; see [`JobMap::open`](super::job_map::JobMap::open). `dispatch` is the reason if another
+    /// release must run it.
+    pub(super) fn open(&self, id: JobId, dispatch: Result<Dispatch, String>, pins: Vec<Pin>) {
+        if let Err(why) = &dispatch {
+            tracing::warn!(job_id = %id, why, "a job is left to the release that wrote its record");
+        }
+        // Unpins after the end of the statement, without the lock.
+        let _replaced = self.lock().open(id, dispatch.ok(), pins);
+    }
+
+    /// Removes a job from the unfinished ones.
+    pub(super) fn close(&self, id: &JobId) {
+        let _removed = self.lock().close(id);
     }
 
     /// Admits the record of a new job. At a cap, forgets ended jobs.
     pub(super) async fn admit(&self, id: &JobId) -> Result<RecordReservation, StoreError> {
-        let caps = RecordCaps { total: self.config.records, per_client: self.config.records_per_client };
-        let (reservation, removed) = self.store.admit_record(&Name::job(id.as_str())?, caps).await?;
+        let (reservation, removed) = self.store.admit_record(&Name::job(id.as_str())?, &self.config).await?;
         for id in removed.iter().filter_map(|name| name.stem().parse().ok()) {
             self.lock().jobs.remove(&id);
         }
         Ok(reservation)
     }
 
-    /// Adds the job of an open record to the open jobs, with pins of its inputs. Returns the digest of its input.
-    pub(super) fn track(&self, record: &JobRecord) -> Result<Digest, EndError> {
-        let (input, map) = input_of(record)?;
-        let pins = self.pins(&record.id, [input].into_iter().chain(map), record.namespace);
-        let pins = pins.map_err(|error| EndError::Lost { why: error.to_string() })?;
-        let request = record.request();
-        if let Err(why) = &request {
-            tracing::warn!(job_id = %record.id, why, "a job is left to the release that wrote its record");
-        }
-        self.open.insert(record.id.clone(), request.is_ok().then(|| Dispatch::of(record)), pins);
-        Ok(input)
+    /// Adds the job of an open record to the open jobs, with pins of its inputs.
+    pub(super) fn track(&self, record: &JobRecord) {
+        self.open(record.id.clone(), record.request().map(|_| Dispatch::of(record)), self.pins(record));
     }
 
     /// Writes the latest record of a job, and makes its end visible. Writers of one job take turns, so the last write
@@ -80,9 +77,14 @@ impl JobStoreState {
         }
         let id = record.id.clone();
         job.publish_end(self.write_end(record).await?);
-        self.open.remove(&id);
+        self.close(&id);
         self.broker.publish(&id, JobEvent::Ended);
         Ok(())
+    }
+
+    /// Writes the latest record of a job, and repeats that while the store rejects it for now.
+    pub(super) async fn write_job_until_stored(&self, job: &DurableJob) -> Result<(), StoreError> {
+        retry(&job.id(), self.retry_time(), StoreError::is_temporary, || self.write_job(job)).await
     }
 
     /// Writes the record of an end, unless an end is on record, and returns the record in the store.
@@ -139,10 +141,10 @@ impl JobStoreState {
         Err(StoreError::Quarantined { name: name.to_string() })
     }
 
-    /// Reads the records of open jobs that this process does not know yet, in the order of their acceptance. Removes
-    /// those of jobs that have ended. Forgets jobs that are not on record any more.
-    async fn read_unknown(&self) -> Result<UnknownJobs, StoreError> {
-        let mut known = self.open.ids();
+    /// Returns the names of the records of open jobs that this process does not know yet. Removes those of jobs that
+    /// have ended. Forgets jobs that are not on record any more.
+    async fn unknown_records(&self) -> Result<Vec<Name>, StoreError> {
+        let mut known = self.lock().open_ids();
         let records = self.store.job_records().await?;
         let (ends, others): (Vec<_>, Vec<_>) = records.into_iter().partition(Name::is_ended_job);
         let mut unfinished = Vec::new();
@@ -155,39 +157,10 @@ impl JobStoreState {
             }
         }
         for gone in &known {
-            self.open.remove(gone);
+            self.close(gone);
         }
-        let read = |name: Name| async move { (self.read_document(&name).await, name) };
-        let mut reads = stream::iter(unfinished).map(read).buffer_unordered(CONCURRENT_READS);
-        let mut unknown = UnknownJobs { records: Vec::new(), error: None };
-        while let Some((read, name)) = reads.next().await {
-            match read {
-                Ok(record) => unknown.records.extend(record),
-                Err(StoreError::Quarantined { .. }) => {}
-                Err(error @ StoreError::OtherRelease { .. }) => self.leave(&name, &error),
-                Err(error) => unknown.error = Some(error),
-            }
-        }
-        drop(reads);
-        unknown.records.sort_by_key(|record| (record.created_ms, record.id.clone()));
-        Ok(unknown)
+        Ok(unfinished)
     }
-
-    /// Leaves an open job to the release that wrote its record.
-    fn leave(&self, name: &Name, error: &StoreError) {
-        if let Ok(id) = name.stem().parse::<JobId>() {
-            tracing::warn!(job_id = %id, %error, "a job is left to the release that wrote its record");
-            self.open.insert(id, None, vec![self.store.pin(name)]);
-        }
-    }
-}
-
-/// Records of open jobs that this process did not know.
-struct UnknownJobs {
-    /// In the order of acceptance.
-    records: Vec<JobRecord>,
-    /// Last error of a record that was not read. It does not delay the jobs of the others.
-    error: Option<StoreError>,
 }
 
 /// Returns the job that has the idempotency key of `record`, if both requests are the same.
@@ -195,25 +168,13 @@ pub(super) fn existing(record: &JobRecord, view: JobView) -> Result<JobView, Acc
     if record.is_same_request(&view.record) { Ok(view) } else { Err(AcceptError::OtherRequest) }
 }
 
-/// Error of [`JobStore::load_input`].
-#[derive(Debug, Error)]
-pub(super) enum LoadError {
-    /// The store has no such input.
-    #[error("its input was removed")]
-    Removed,
-    #[error(transparent)]
-    Memory(#[from] OutOfMemory),
-    #[error(transparent)]
-    Store(#[from] StoreError),
-}
-
 impl JobStore {
     /// Returns the task of a record, without its input.
-    pub(super) fn task_of(&self, record: &JobRecord, digest: Digest) -> Result<(Task, Format), String> {
+    pub(super) fn task_of(&self, record: &JobRecord) -> Result<(Task, Format), String> {
         let request = record.request()?;
         let task = Task {
             input: Input::File(Bytes::new()),
-            digest,
+            digest: record.input,
             namespace: record.namespace,
             strict: request.strict,
             options: request.options,
@@ -225,34 +186,29 @@ impl JobStore {
         Ok((task, request.format))
     }
 
-    /// Loads the input of a task and its map, charged to the memory budget before they are read.
-    pub(super) async fn load_input(&self, task: &mut Task) -> Result<(), LoadError> {
-        let reservation = self.0.pool.settings().budget.for_client(task.rank.client.0).reservation();
-        let map: Option<Digest> = match &task.options.map {
-            Some(map) => Some(map.digest().parse().map_err(|_bad: BadDigest| LoadError::Removed)?),
-            None => None,
-        };
-        let load = async |digest: Digest| {
-            let name = Name::input(&digest).within(task.namespace);
-            reservation.grow(self.0.store.head(&name).await?.ok_or(LoadError::Removed)?.size)?;
-            self.0.store.input(&digest, task.namespace).await?.ok_or(LoadError::Removed)
-        };
-        let file = load(task.digest).await?;
-        let loaded = match map {
-            Some(digest) => Some(MapFile::new(digest.to_string(), load(digest).await?)),
-            None => None,
-        };
-        task.options.map = loaded;
-        task.input = Input::File(file);
-        task.reservation = Some(Arc::new(reservation));
-        Ok(())
-    }
-
     /// Dispatches the unfinished jobs that neither the broker nor this process has, such as those of an earlier
     /// process, and returns their number. After the error of a single record, the others were handled.
     pub(crate) async fn reconcile(&self) -> Result<usize, StoreError> {
         let inner = &self.0;
-        let UnknownJobs { records, mut error } = inner.read_unknown().await?;
+        let read = |name: Name| async move { (inner.read_document(&name).await, name) };
+        let mut reads = stream::iter(inner.unknown_records().await?).map(read).buffer_unordered(CONCURRENT_READS);
+        let (mut records, mut error) = (Vec::new(), None);
+        while let Some((read, name)) = reads.next().await {
+            match read {
+                Ok(record) => records.extend(record),
+                Err(StoreError::Quarantined { .. }) => {}
+                Err(other @ StoreError::OtherRelease { .. }) => {
+                    if let Ok(id) = name.stem().parse() {
+                        inner.open(id, Err(other.to_string()), vec![inner.store.pin(&name)]);
+                    }
+                }
+                // It does not delay the jobs of the other records.
+                Err(failed) => error = Some(failed),
+            }
+        }
+        drop(reads);
+        // In the order of acceptance.
+        records.sort_by_key(|record| (record.created_ms, record.id.clone()));
         // If no record was read, the store fails, and no input is protected yet.
         let is_any_read = !records.is_empty() || error.is_none();
         for record in records {
@@ -260,9 +216,8 @@ impl JobStore {
                 if let Err(failed) = inner.write_end(record).await {
                     error = Some(failed);
                 }
-            } else if let Err(error) = inner.track(&record) {
-                let job = self.insert_open(record);
-                self.finish(&job, Err(error)).await;
+            } else {
+                inner.track(&record);
             }
         }
         if is_any_read {
@@ -272,8 +227,9 @@ impl JobStore {
         if inner.broker.down().is_some() {
             return error.map_or(Ok(0), Err);
         }
-        for dispatch in inner.open.all() {
-            if inner.lock().jobs.get(&dispatch.id).is_some_and(|job| job.is_owned()) {
+        let dispatches = inner.lock().dispatches();
+        for dispatch in dispatches {
+            if inner.lock().is_owned(&dispatch.id) {
                 continue;
             }
             match inner.broker.dispatch(&dispatch).await {
@@ -301,6 +257,6 @@ impl JobStore {
 
     /// Returns the number of unfinished jobs of other releases, which this process leaves alone.
     pub(crate) fn other_release_count(&self) -> usize {
-        self.0.open.other_release_count()
+        self.0.lock().other_release_count()
     }
 }

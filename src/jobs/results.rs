@@ -1,6 +1,6 @@
 //! Storing of results: the mesh file and its report, named by their content key.
 
-use std::io::{self, Write};
+use std::io;
 use std::sync::Arc;
 
 use bytes::Bytes;
@@ -9,7 +9,7 @@ use thiserror::Error;
 
 use super::{ContentKey, Finished};
 use crate::formats::{Format, FormatError};
-use crate::store::{Digest, Hasher, Pin, Store, StoreError};
+use crate::store::{Digest, Pin, Store, StoreError};
 use crate::surface::{Exceeded, Limit};
 
 /// File name extension of a report.
@@ -51,31 +51,13 @@ impl SaveError {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 struct Sums {
     mesh_bytes: u64,
-    #[serde(with = "text")]
     mesh_sha256: Digest,
-    #[serde(with = "text")]
     report_sha256: Digest,
 }
 
-/// Digests as text.
-mod text {
-    use serde::de::Error as _;
-    use serde::{Deserialize as _, Deserializer, Serializer};
-
-    use crate::store::Digest;
-
-    pub(super) fn serialize<S: Serializer>(digest: &Digest, to: S) -> Result<S::Ok, S::Error> {
-        to.collect_str(digest)
-    }
-
-    pub(super) fn deserialize<'de, D: Deserializer<'de>>(from: D) -> Result<Digest, D::Error> {
-        String::deserialize(from)?.parse().map_err(D::Error::custom)
-    }
-}
-
 /// Returns the file of a report: the document, and a line with the digests of the document and of its mesh.
-pub(super) fn report_file(mut document: Vec<u8>, mesh: &Hasher, mesh_bytes: u64) -> Result<Bytes, SaveError> {
-    let (mesh_sha256, report_sha256) = (mesh.clone().digest(), Digest::of(&document));
+pub(super) fn report_file(mut document: Vec<u8>, mesh_bytes: u64, mesh_sha256: Digest) -> Result<Bytes, SaveError> {
+    let report_sha256 = Digest::of(&document);
     document.push(b'\n');
     serde_json::to_writer(&mut document, &Sums { mesh_bytes, mesh_sha256, report_sha256 })
         .map_err(|e| SaveError::Other(e.to_string()))?;
@@ -106,26 +88,6 @@ pub(crate) async fn is_stored(store: &Store, format: Format, key: &ContentKey) -
     store.is_intact(&mesh, sums.mesh_bytes, &sums.mesh_sha256).await
 }
 
-/// Writer that hashes what it writes.
-struct Hashing<W> {
-    writer: W,
-    hasher: Hasher,
-    bytes: u64,
-}
-
-impl<W: Write> Write for Hashing<W> {
-    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
-        let n = self.writer.write(bytes)?;
-        self.hasher.update(&bytes[..n]);
-        self.bytes += n as u64;
-        Ok(n)
-    }
-
-    fn flush(&mut self) -> io::Result<()> {
-        self.writer.flush()
-    }
-}
-
 /// Stores the mesh as `format` and the report, unless both are stored already. The report comes last, because it
 /// contains the digest of the mesh. They are not removed before the returned pin is dropped.
 pub(crate) async fn save(
@@ -152,10 +114,10 @@ pub(crate) async fn save(
             return Err(SaveError::Format(error.error()));
         }
         let write = || {
-            let mut writer = Hashing { writer: writing.writer(&name), hasher: Hasher::default(), bytes: 0 };
-            file.write(&mut writer).and_then(|()| writer.flush()).map_err(from_io)?;
-            writer.writer.finish()?;
-            report_file(document.clone(), &writer.hasher, writer.bytes)
+            let mut writer = writing.writer(&name);
+            file.write(&mut writer).map_err(from_io)?;
+            let (mesh_bytes, mesh_sha256) = writer.finish()?;
+            report_file(document.clone(), mesh_bytes, mesh_sha256)
         };
         match write() {
             Err(SaveError::Store(StoreError::NoSpace { .. })) if runtime.block_on(writing.evict_for(bytes)) => write(),

@@ -1,14 +1,17 @@
 //! Runs of jobs in this process, and their orderly stop: no more jobs are claimed, claimed ones are finished, and those
 //! that are not finished in time return to the queue.
 
+use std::time::Duration;
+
 use tokio::sync::watch;
 
+use super::broker::ClaimEnd;
 use super::durable_job::DurableJob;
 use super::job_store::JobStore;
 
 /// Phase of the stop. Later phases include the restrictions of earlier ones.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, PartialOrd, Ord)]
-enum Phase {
+pub(super) enum Phase {
     /// Jobs are claimed and run.
     #[default]
     Serve,
@@ -18,15 +21,30 @@ enum Phase {
     Return,
 }
 
-/// End of a run.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum RunResult {
-    /// The end of the job is on record.
-    Finished,
-    /// The job has returned to the queue.
-    Returned,
-    /// The store has rejected the record of the end or of the return.
-    Unrecorded,
+/// End of a claim or a run of a job.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct RunEnd {
+    /// End of the claim: done if the job has ended, a release if it returns to the queue.
+    pub(super) claim: ClaimEnd,
+    /// False if the store has rejected the record of the end or of the return. `None` if this run made neither.
+    recorded: Option<bool>,
+}
+
+impl RunEnd {
+    /// The job has ended.
+    pub(super) const fn done(recorded: bool) -> Self {
+        Self { claim: ClaimEnd::Done, recorded: Some(recorded) }
+    }
+
+    /// The job returns to the queue, and can be claimed again after `delay`.
+    pub(super) const fn returned(delay: Duration, recorded: bool) -> Self {
+        Self { claim: ClaimEnd::Release(delay), recorded: Some(recorded) }
+    }
+
+    /// The run was not necessary, or another one takes over.
+    pub(super) const fn unused(claim: ClaimEnd) -> Self {
+        Self { claim, recorded: None }
+    }
 }
 
 /// Numbers of asynchronous jobs by their state after a stop.
@@ -57,22 +75,8 @@ pub(super) struct Runs {
 }
 
 impl Runs {
-    /// Waits until no more jobs are claimed.
-    pub(super) async fn finishing(&self) {
-        self.reached(Phase::Finish).await;
-    }
-
-    /// Waits until unfinished jobs return to the queue.
-    pub(super) async fn returning(&self) {
-        self.reached(Phase::Return).await;
-    }
-
-    /// Returns true once unfinished jobs return to the queue.
-    fn are_returning(&self) -> bool {
-        *self.phase.borrow() == Phase::Return
-    }
-
-    async fn reached(&self, phase: Phase) {
+    /// Waits until the stop has reached a phase.
+    pub(super) async fn reached(&self, phase: Phase) {
         // The sender is in `self`.
         drop(self.phase.subscribe().wait_for(|now| *now >= phase).await);
     }
@@ -81,13 +85,13 @@ impl Runs {
 /// Claim or runner of a job. It is counted until it is dropped.
 pub(super) struct RunGuard {
     jobs: JobStore,
-    result: Option<RunResult>,
+    end: Option<RunEnd>,
 }
 
 impl RunGuard {
-    /// Ends the run. `result` is its result, unless another claim or runner has taken over.
-    pub(super) fn end(mut self, result: Option<RunResult>) {
-        self.result = result;
+    /// Ends the run.
+    pub(super) fn end(mut self, end: RunEnd) {
+        self.end = Some(end);
     }
 }
 
@@ -97,11 +101,11 @@ impl Drop for RunGuard {
         let stops = *runs.phase.borrow() > Phase::Serve;
         runs.counts.send_modify(|RunCounts { running, stopped }| {
             *running -= 1;
-            match self.result.filter(|_| stops) {
-                Some(RunResult::Finished) => stopped.finished += 1,
-                Some(RunResult::Returned) => stopped.returned += 1,
-                Some(RunResult::Unrecorded) => stopped.unrecorded += 1,
-                None => {}
+            match self.end.filter(|_| stops) {
+                Some(RunEnd { claim: ClaimEnd::Done, recorded: Some(true) }) => stopped.finished += 1,
+                Some(RunEnd { recorded: Some(true), .. }) => stopped.returned += 1,
+                Some(RunEnd { recorded: Some(false), .. }) => stopped.unrecorded += 1,
+                Some(RunEnd { recorded: None, .. }) | None => {}
             }
         });
     }
@@ -111,12 +115,12 @@ impl JobStore {
     /// Counts a claim or a runner.
     pub(super) fn count_run(&self) -> RunGuard {
         self.0.runs.counts.send_modify(|counts| counts.running += 1);
-        RunGuard { jobs: self.clone(), result: None }
+        RunGuard { jobs: self.clone(), end: None }
     }
 
     /// Counts and records an attempt, unless the job has ended or returns to the queue.
     pub(super) async fn begin(&self, job: &DurableJob) {
-        if job.begin(|| !self.0.runs.are_returning())
+        if job.begin(|| *self.0.runs.phase.borrow() < Phase::Return)
             && let Err(error) = self.0.write_job(job).await
         {
             tracing::error!(job_id = %job.id(), %error, "cannot record an attempt to run a job");

@@ -9,8 +9,8 @@ use std::time::Duration;
 use metrics::{counter, gauge};
 
 use super::kept::{
-    CacheKey, CacheState, Charge, Charged, Input, Kept, Shared, SharedColors, SharedStructure, SharedTileset,
-    streamed_digest, tileset_digest,
+    CacheKey, CacheState, Charged, Input, Kept, Shared, SharedColors, SharedStructure, SharedTileset, streamed_digest,
+    tileset_digest,
 };
 use super::{MemoryReservation, ScratchSpace};
 use crate::memory_budget::{Budget, Reclaim};
@@ -68,12 +68,9 @@ impl Structures {
         let tilesets = options.map(|options| [tileset_digest(&digest, options), streamed_digest(&digest, options)]);
         let mut state = self.lock();
         let mut digests = tilesets.into_iter().flatten().chain([digest]);
-        match digests.find_map(|digest| state.find(&(namespace, digest)))? {
-            Kept::Structure(structure) => Some(Input::Kept(structure)),
-            Kept::Tileset(tileset) if tileset.is_streamed() => Some(Input::Tileset(tileset)),
-            Kept::Tileset(tileset) => Some(Input::Kept(tileset.structure().clone())),
-            Kept::Colors(_) => None,
-        }
+        let kept = digests.find_map(|digest| state.find(&(namespace, digest)))?;
+        let Some(tileset): Option<SharedTileset> = kept.get() else { return kept.get().map(Input::Kept) };
+        Some(if tileset.is_streamed() { Input::Tileset(tileset) } else { Input::Kept(tileset.structure().clone()) })
     }
 
     /// Returns the structure of the file with this digest, reading `input` if necessary. Concurrent calls read it once
@@ -105,7 +102,7 @@ impl Structures {
         control.memory.also_held(file.len() as u64);
         let key = (namespace, digest);
         let found = self.find_or_begin(&[key], &control.cancel).ok_or(StructureError::Cancelled)?;
-        if let Lookup::Kept(Kept::Structure(kept)) = found {
+        if let Some(kept) = found.as_ref().ok().and_then(Kept::get) {
             return hit(kept);
         }
         counter!(STRUCTURE_CACHE_REQUESTS, "result" => "miss").increment(1);
@@ -118,7 +115,7 @@ impl Structures {
         let read = self.charged(structure, input, reservation);
         control.memory.also_held(read.bytes());
         if read.bytes() <= self.limit {
-            self.keep(key, Kept::Structure(read.clone()));
+            self.keep(key, read.clone().into());
         }
         Ok(read)
     }
@@ -139,18 +136,17 @@ impl Structures {
         control: &Control<'_>,
         clock: &StageClock<'_>,
     ) -> Result<(SharedTileset, Option<SharedColors>), JobError> {
-        let as_tileset = |kept: Kept| if let Kept::Tileset(tileset) = kept { Some(tileset) } else { None };
         let [memory_digest, disk_digest] = [tileset_digest(&digest, options), streamed_digest(&digest, options)];
         let keys = [memory_digest, disk_digest].map(|digest| (namespace, digest));
         let in_memory = |limits: &ReadLimits| {
             let read = |control: &Control<'_>| self.get(namespace, digest, input, limits, control);
             let prepare = |control: &Control<'_>| Tileset::new(read, options, limits, control, clock);
-            self.made(keys[0], input, control, &self.budget.part(self.limit), Kept::Tileset, prepare)
+            self.made(keys[0], input, control, &self.budget.part(self.limit), prepare)
         };
         let on_disk = |scratch: &ScratchSpace| {
             let prepare = |control: &Control<'_>| self.streamed(scratch, input, options, limits, control, clock);
             // Only what remains must fit into the cache, not the memory of reading and sorting.
-            self.made(keys[1], input, control, &self.budget, Kept::Tileset, prepare)
+            self.made(keys[1], input, control, &self.budget, prepare)
         };
         let not_on_disk = tileset::needs_memory(options, 1).map(|(name, ..)| name);
         let make = || match &self.scratch {
@@ -178,16 +174,15 @@ impl Structures {
         };
         let tileset = match input {
             Input::Tileset(tileset) => tileset.clone(),
-            _ => self.found_or_made(&keys, control, as_tileset, make)?,
+            _ => self.found_or_made(&keys, control, make)?,
         };
         let prepared_digest = if tileset.is_streamed() { disk_digest } else { memory_digest };
         let Some(coloring) = options.color else { return Ok((tileset, None)) };
         let key = (namespace, Digest::of(format!("colors\n{prepared_digest}\n{}", coloring.canonical()).as_bytes()));
         let prepare = |control: &Control<'_>| tileset.colors(coloring, control);
-        let as_colors = |kept: Kept| if let Kept::Colors(colors) = kept { Some(colors) } else { None };
         let budget = self.budget.part(self.limit);
-        let make = || self.made(key, input, control, &budget, Kept::Colors, prepare);
-        let colors = self.found_or_made(&[key], control, as_colors, make)?;
+        let make = || self.made(key, input, control, &budget, prepare);
+        let colors = self.found_or_made(&[key], control, make)?;
         Ok((tileset, Some(colors)))
     }
 
@@ -226,16 +221,15 @@ impl Structures {
     }
 
     /// Returns the value with one of the keys, and calls `make` if there is none.
-    fn found_or_made<T>(
+    fn found_or_made<T: Send + Sync + 'static>(
         &self,
         keys: &[CacheKey],
         control: &Control<'_>,
-        kept_as: impl Fn(Kept) -> Option<Shared<T>>,
         make: impl FnOnce() -> Result<Shared<T>, JobError>,
     ) -> Result<Shared<T>, JobError> {
         let found = self.find_or_begin(keys, &control.cancel).ok_or(SurfaceError::Cancelled)?;
-        if let Lookup::Kept(kept) = &found
-            && let Some(kept) = kept_as(kept.clone())
+        if let Ok(kept) = &found
+            && let Some(kept) = kept.get::<T>()
         {
             control.memory.also_held(kept.bytes());
             return Ok(kept);
@@ -244,13 +238,12 @@ impl Structures {
     }
 
     /// Prepares a value with memory of `budget`, and keeps it. It must fit into the cache.
-    fn made<T>(
+    fn made<T: Send + Sync + 'static>(
         &self,
         key: CacheKey,
         input: &Input,
         control: &Control<'_>,
         budget: &Budget,
-        keep: fn(Shared<T>) -> Kept,
         prepare: impl FnOnce(&Control<'_>) -> Result<T, JobError>,
     ) -> Result<Shared<T>, JobError> {
         let limit = self.limit;
@@ -268,21 +261,22 @@ impl Structures {
         }
         let shared = self.charged(value, input, reservation);
         control.memory.also_held(shared.bytes());
-        self.keep(key, keep(shared.clone()));
+        self.keep(key, shared.clone().into());
         Ok(shared)
     }
 
-    /// Finds a value with one of the keys, or begins to make it: the caller keeps the mark of the first key meanwhile.
+    /// Finds a value with one of the keys, or returns the mark of the first key, which the caller keeps while it makes
+    /// the value.
     /// Waits while another request makes it; `None` if this one is cancelled. There is at least one key.
-    fn find_or_begin(&self, keys: &[CacheKey], cancel: &CancelToken) -> Option<Lookup<'_>> {
+    fn find_or_begin(&self, keys: &[CacheKey], cancel: &CancelToken) -> Option<Result<Kept, MakingMark<'_>>> {
         let key = *keys.first()?;
         let mut state = self.lock();
         loop {
             if let Some(kept) = keys.iter().find_map(|key| state.find(key)) {
-                return Some(Lookup::Kept(kept));
+                return Some(Ok(kept));
             }
             if self.limit == 0 || state.making.insert(key) {
-                return Some(Lookup::Missing { _mark: MakingMark { structures: self, key } });
+                return Some(Err(MakingMark { structures: self, key }));
             }
             state = self.ended.wait_timeout(state, POLL).unwrap_or_else(PoisonError::into_inner).0;
             if cancel.is_cancelled() {
@@ -294,11 +288,7 @@ impl Structures {
     /// Charges a value to the budget.
     fn charged<T>(&self, value: T, input: &Input, reservation: Arc<MemoryReservation>) -> Shared<T> {
         let bytes = reservation.bytes();
-        let charge = if bytes <= self.limit {
-            Charge::Kept { _buffers: reservation.to_buffers() }
-        } else {
-            Charge::Used { _reservation: reservation }
-        };
+        let charge = if bytes <= self.limit { Ok(reservation.to_buffers()) } else { Err(reservation) };
         let (file_bytes, atoms) = (input.file_bytes(), input.atoms());
         Shared(Arc::new(Charged { value, file_bytes, atoms, bytes, _charge: charge }))
     }
@@ -341,22 +331,13 @@ impl Reclaim for Structures {
         while freed < bytes
             && let Some(kept) = state.evict(|kept| !kept.is_used())
         {
-            freed += kept.bytes();
+            freed += kept.bytes;
             evicted.push(kept);
         }
         publish(&state);
         drop(state);
         freed > 0
     }
-}
-
-/// Result of a search for a value.
-enum Lookup<'a> {
-    Kept(Kept),
-    /// The caller makes the value, and keeps the mark meanwhile.
-    Missing {
-        _mark: MakingMark<'a>,
-    },
 }
 
 /// Mark of a value that a request is making. Dropping it, even after an error or a panic, lets others make it.
@@ -456,7 +437,7 @@ mod tests {
         }
         let state = structures.lock();
         assert!((400..=400 * 5 / 4).contains(&state.kept.len()), "{} structures", state.kept.len());
-        assert_eq!(state.bytes, state.kept.values().map(|(_, kept)| kept.bytes()).sum::<u64>());
+        assert_eq!(state.bytes, state.kept.values().map(|(_, kept)| kept.bytes).sum::<u64>());
         assert_eq!(state.by_use.len(), state.kept.len());
     }
 

@@ -95,7 +95,7 @@ impl Fixture {
         let record = JobRecord {
             id: new_id(),
             namespace: Namespace::default(),
-            input: digest.to_string(),
+            input: digest,
             map: None,
             parameters: vec![("resolution".to_owned(), "2".to_owned())],
             format: "stl".to_owned(),

@@ -19,41 +19,27 @@ use crate::structure::{ReadLimits, StructureError};
 use crate::surface::{Column, Control, MemoryMeter as _, SurfaceError};
 use crate::telemetry::{GRID_POINTS, JOBS_FALLBACK, JOBS_FINISHED, PANICS, STAGE_DURATION, TRIANGLES, TraceSpan};
 
-/// End of a task.
-enum TaskEnd {
-    Ended(Outcome),
-    /// All clients left before the start of the job.
-    Dismissed,
-    /// The job is queued again, in another lane.
-    Restarted,
-}
+/// A job that is queued again, in another lane.
+struct Restarted;
 
 /// Runs the jobs of a lane until the queue is closed and the lane is empty.
 pub(super) fn work(shared: &WorkerContext, lane: Lane) {
     while let Some(entry) = shared.queue.pop(lane) {
         let (id, client) = (entry.id, entry.task.rank.client);
         let start = Instant::now();
-        let end = shared.threads.run(lane, || run(shared, entry));
-        let outcome = match end {
-            TaskEnd::Ended(outcome) => Some(outcome),
-            TaskEnd::Dismissed => None,
-            TaskEnd::Restarted => continue,
-        };
+        let Ok(outcome) = shared.threads.run(lane, || run(shared, entry)) else { continue };
         if let Some(meter) = &shared.settings.meter {
             meter(client, start.elapsed());
         }
         shared.publish_devices();
         // Successful jobs count in the duration estimate, and those that were cancelled, such as at a deadline.
-        let counts = matches!(
-            outcome,
-            Some(Ok(_) | Err(Failure::Job { error: JobError::Surface(SurfaceError::Cancelled), .. }))
-        );
+        let counts = matches!(&outcome, Some(outcome) if outcome.as_ref().err().is_none_or(Failure::is_cancelled));
         shared.queue.done(id, outcome, counts.then(|| start.elapsed()));
     }
 }
 
-/// Runs one job.
-fn run(shared: &WorkerContext, entry: QueuedTask) -> TaskEnd {
+/// Runs one job. Returns no outcome if all clients left before its start.
+fn run(shared: &WorkerContext, entry: QueuedTask) -> Result<Option<Outcome>, Restarted> {
     let QueuedTask { id: entry_id, task, cancel, progress, on_start, accepted, span } = entry;
     let log = span.as_parent().log_span(task.id.as_ref().map(JobId::as_str));
     let _entered = log.enter();
@@ -61,11 +47,11 @@ fn run(shared: &WorkerContext, entry: QueuedTask) -> TaskEnd {
     if cancel.is_cancelled() {
         // It may have had to give its worker away before the threads of the worker were ready.
         if shared.queue.restart(entry_id, task, on_start).is_none() {
-            return TaskEnd::Restarted;
+            return Err(Restarted);
         }
         counter!(JOBS_FINISHED, "outcome" => "dismissed").increment(1);
         end_span(&span, id, "dismissed", None);
-        return TaskEnd::Dismissed;
+        return Ok(None);
     }
     let waited = accepted.elapsed();
     span.part("queue", accepted, waited);
@@ -124,9 +110,9 @@ fn run(shared: &WorkerContext, entry: QueuedTask) -> TaskEnd {
         reservation.set(bytes_of(&product));
         Ok(Finished { product, diagnostics, digest: task.digest, reservation })
     });
-    let was_cancelled = matches!(outcome, Err(Failure::Job { error: JobError::Surface(SurfaceError::Cancelled), .. }));
+    let was_cancelled = outcome.as_ref().err().is_some_and(Failure::is_cancelled);
     let task = if was_cancelled { shared.queue.restart(entry_id, task, Vec::new()) } else { Some(task) };
-    let Some(task) = task else { return TaskEnd::Restarted };
+    let Some(task) = task else { return Err(Restarted) };
     // Frees the input before the outcome is sent, so that the receiver sees the true memory use.
     drop(task);
     let outcome = outcome.map(Arc::new);
@@ -134,7 +120,7 @@ fn run(shared: &WorkerContext, entry: QueuedTask) -> TaskEnd {
         span.part(stage, begun, time);
     }
     end_span(&span, id, count_outcome(&outcome), Some(&outcome));
-    TaskEnd::Ended(outcome)
+    Ok(Some(outcome))
 }
 
 /// Computes the mesh of a task, on its structure or on a tileset that is kept in memory.
@@ -215,7 +201,7 @@ fn explained(shared: &WorkerContext, file: Option<&Bytes>, error: JobError, cont
 fn count_outcome(outcome: &Outcome) -> &'static str {
     let label = match outcome {
         Ok(_) => "successful",
-        Err(Failure::Job { error: JobError::Surface(SurfaceError::Cancelled), .. }) => "dismissed",
+        Err(failure) if failure.is_cancelled() => "dismissed",
         Err(Failure::Panicked { .. }) => "panicked",
         Err(_) => "failed",
     };
@@ -289,16 +275,16 @@ mod tests {
             shared.queue.make_room();
         }
         let run = |entry| tokio::task::block_in_place(|| super::run(shared, entry));
-        assert!(matches!(run(entry), TaskEnd::Restarted) && !started.load(Ordering::SeqCst));
+        assert!(run(entry).is_err() && !started.load(Ordering::SeqCst));
         let entry = shared.queue.pop(Lane::Long).unwrap();
         let id = entry.id;
-        let TaskEnd::Ended(outcome) = run(entry) else { panic!("the job did not run") };
+        let Ok(Some(outcome)) = run(entry) else { panic!("the job did not run") };
         assert!(started.load(Ordering::SeqCst));
         shared.queue.done(id, Some(outcome), None);
         assert!(ticket.wait().await.is_ok());
         // Control: nobody waits for a job that was cancelled because its client left.
         let entry = shared.queue.pop(Lane::Short).unwrap();
         drop(other);
-        assert!(matches!(run(entry), TaskEnd::Dismissed));
+        assert!(matches!(run(entry), Ok(None)));
     }
 }

@@ -151,15 +151,18 @@ impl Backend {
         timeout(self.limit, work).await.unwrap_or_else(late)
     }
 
-    /// Runs a blocking operation in a folder, for at most `store.timeout_ms`.
-    async fn blocking<T: Send + 'static>(
+    /// Runs a blocking operation in the folder, for at most `store.timeout_ms`. `None` on S3.
+    async fn in_folder<T: Send + 'static>(
         &self,
         op: &'static str,
         at: &str,
-        work: impl FnOnce() -> io::Result<T> + Send + 'static,
-    ) -> Result<T, StoreError> {
-        let done = async { spawn_blocking(work).await.unwrap_or_else(|e| Err(e.into())).map_err(from_io) };
-        self.timed(done).await.map_err(|error| self.fail(op, at, &error))
+        work: impl FnOnce(&FilePath) -> io::Result<T> + Send + 'static,
+    ) -> Option<Result<T, StoreError>> {
+        let StorageKind::Local(root) = &self.kind else { return None };
+        let root = root.clone();
+        let done = spawn_blocking(move || work(&root));
+        let done = async { done.await.unwrap_or_else(|e| Err(e.into())).map_err(from_io) };
+        Some(self.timed(done).await.map_err(|error| self.fail(op, at, &error)))
     }
 
     /// Classifies and counts an error. `at` is a path relative to the root of the store.
@@ -259,14 +262,9 @@ impl Backend {
 
     /// Reads the secret of the store, or creates it.
     pub(super) async fn secret(&self) -> Result<Secret, StoreError> {
-        let outcome = match &self.kind {
-            StorageKind::Local(root) => {
-                let root = root.clone();
-                self.blocking("secret", "secret", move || secret::in_folder(&root)).await
-            }
-            StorageKind::S3(_) => {
-                secret::in_bucket(self.objects.as_ref()).await.map_err(|e| self.fail("secret", "secret", &e))
-            }
+        let outcome = match self.in_folder("secret", "secret", secret::in_folder).await {
+            Some(outcome) => outcome,
+            None => secret::in_bucket(self.objects.as_ref()).await.map_err(|e| self.fail("secret", "secret", &e)),
         };
         if let Ok(secret) = &outcome {
             self.secret.get_or_init(|| *secret);
@@ -277,26 +275,20 @@ impl Backend {
     /// Checks that the folder of the store is still there: a write would create it again, and its objects would be lost
     /// when the right folder returns.
     pub(super) async fn check_folder(&self) -> Result<(), StoreError> {
-        let StorageKind::Local(root) = &self.kind else { return Ok(()) };
         let Some(secret) = self.secret.get().copied() else { return Ok(()) };
-        let root = root.clone();
-        let found = move || secret::is_in_folder(&root, &secret);
-        self.blocking("folder", "", found).await
+        let found = self.in_folder("folder", "", move |root| secret::is_in_folder(root, &secret)).await;
+        found.unwrap_or(Ok(()))
     }
 
     /// Returns the free bytes of the disk, 0 if unknown; `None` on S3.
     pub(super) async fn free_bytes(&self) -> Option<u64> {
-        let StorageKind::Local(root) = &self.kind else { return None };
-        let root = root.clone();
-        Some(self.blocking("free", "", move || Ok(free_bytes(&root))).await.unwrap_or(0))
+        Some(self.in_folder("free", "", |root| Ok(free_bytes(root))).await?.unwrap_or(0))
     }
 
     /// Sets the modification times of objects to their last uses, which the next process reads. S3 has no such
     /// operation.
     pub(super) async fn save_uses(&self, uses: Vec<(Name, SystemTime)>) -> Result<(), StoreError> {
-        let StorageKind::Local(root) = &self.kind else { return Ok(()) };
-        let root = root.clone();
-        let save = move || {
+        let save = move |root: &FilePath| {
             for (name, used) in uses {
                 match std::fs::File::open(root.join(name.to_string())).and_then(|file| file.set_modified(used)) {
                     Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(error),
@@ -305,7 +297,7 @@ impl Backend {
             }
             Ok(())
         };
-        self.blocking("use", "", save).await
+        self.in_folder("use", "", save).await.unwrap_or(Ok(()))
     }
 
     /// Removes leftovers of crashed processes: staged files, unfinished uploads, checks. Returns their number.
@@ -319,14 +311,12 @@ impl Backend {
             removed += 1;
         }
         let unfinished = match &self.kind {
-            StorageKind::Local(root) => {
-                let folders: Vec<_> =
-                    Folder::ALL.map(Folder::as_str).into_iter().chain([CHECK]).map(|name| root.join(name)).collect();
-                self.blocking("clear", "", move || stale::clear_files(&folders, now)).await
+            StorageKind::Local(_) => self.in_folder("clear", "", move |root| stale::clear_files(root, now)).await,
+            StorageKind::S3(bucket) => {
+                Some(bucket.clear_uploads(now).await.map_err(|e| self.fail("clear", "", e.as_ref())))
             }
-            StorageKind::S3(bucket) => bucket.clear_uploads(now).await.map_err(|e| self.fail("clear", "", e.as_ref())),
         };
-        unfinished.map(|unfinished| removed + unfinished)
+        unfinished.unwrap_or(Ok(0)).map(|unfinished| removed + unfinished)
     }
 }
 

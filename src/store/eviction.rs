@@ -175,19 +175,12 @@ impl Store {
         missing == 0 && self.0.backend.free_bytes().await.is_none_or(|free| free / 2 >= bytes)
     }
 
-    /// Removes the records of an ended job, unless they were used meanwhile. Returns true if they were removed.
-    pub(super) async fn evict_record(&self, candidate: &EvictionCandidate) -> Result<bool, StoreError> {
-        let removed = self.remove_candidate(candidate.clone()).await?;
-        counter!(STORE_REMOVED, "reason" => "records").increment(u64::from(removed));
-        Ok(removed)
-    }
-
     /// Removes the candidates that are still unused. Returns the numbers of removed objects and bytes; adds failures to
     /// `failed`.
     async fn remove_all(&self, candidates: &[EvictionCandidate], reason: &'static str, failed: &mut u64) -> (u64, u64) {
         let (mut objects, mut bytes) = (0, 0);
         for candidate in candidates {
-            match self.remove_candidate(candidate.clone()).await {
+            match self.remove_candidate(candidate).await {
                 Ok(true) => (objects, bytes) = (objects + candidate.names.len() as u64, bytes + candidate.bytes),
                 Ok(false) => {}
                 Err(error) => {
@@ -200,8 +193,9 @@ impl Store {
         (objects, bytes)
     }
 
-    async fn remove_candidate(&self, candidate: EvictionCandidate) -> Result<bool, StoreError> {
-        let store = self.clone();
+    /// Removes the objects of a candidate, unless they were used meanwhile. Returns true if they were removed.
+    pub(super) async fn remove_candidate(&self, candidate: &EvictionCandidate) -> Result<bool, StoreError> {
+        let (store, candidate) = (self.clone(), candidate.clone());
         self.run_to_completion(async move {
             let Some(first) = candidate.names.first() else { return Ok(false) };
             let _lock = store.write_lock(first).lock().await;

@@ -7,7 +7,8 @@ use metrics::gauge;
 
 use super::name::{Folder, Name};
 use super::object::Usage;
-use super::records::{Admission, JobRecords, RecordCaps};
+use super::records::{AtCap, JobRecords};
+use crate::config::JobsConfig;
 use crate::telemetry::{STORE_BYTES, STORE_OBJECTS};
 
 /// Order of last use. The counter orders uses within one clock tick.
@@ -138,13 +139,12 @@ impl Index {
     }
 
     /// Counts the record of a new job, unless a cap is reached.
-    pub(super) fn admit_record(&mut self, name: &Name, caps: RecordCaps) -> Admission {
-        if let Some((scope, cap, mut ended)) = self.records.at_cap(name, caps) {
-            let oldest = ended.find_map(|name| self.candidate(&name.group()));
-            return oldest.map_or(Admission::Full(scope, cap), Admission::Remove);
+    pub(super) fn admit_record(&mut self, name: &Name, caps: &JobsConfig) -> Result<(), AtCap> {
+        if let Some((scope, limit, mut ended)) = self.records.at_cap(name, caps) {
+            return Err(AtCap { scope, limit, oldest: ended.find_map(|name| self.candidate(&name.group())) });
         }
         self.records.add(name);
-        Admission::Admitted
+        Ok(())
     }
 
     /// Returns the objects of a group, whose names are adjacent.

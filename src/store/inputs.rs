@@ -1,8 +1,6 @@
 //! Uploaded structure files. Their digest is checked whenever they are read, because a damaged file would also spoil
 //! the results that are computed from it. Reading takes longer than hashing, about 0.6 ns per byte.
 
-use std::io;
-
 use bytes::Bytes;
 use futures_util::TryStreamExt as _;
 
@@ -11,7 +9,6 @@ use super::handle::Store;
 use super::name::Name;
 use super::{ByteStream, Digest, Meta, Namespace};
 use crate::sync::spawn_blocking;
-use crate::telemetry::shorten;
 
 impl Store {
     /// Reads an uploaded structure file. A damaged one goes into quarantine, so that another upload can replace it.
@@ -63,10 +60,7 @@ impl Store {
             if has_digest(&read.bytes, &digest).await {
                 return Ok(Some(read.bytes));
             }
-            let error =
-                store.0.backend.fail("verify", &shorten(&name.to_string()), &io::Error::other("the digest differs"));
-            tracing::error!(%error, "a stored structure is damaged; moving it into quarantine");
-            store.move_to_quarantine(&name).await?;
+            store.quarantine_damaged(&name).await?;
             Err(StoreError::Damaged { digest })
         })
         .await

@@ -53,6 +53,6 @@ pub use name::{BadName, Folder, Name};
 pub(crate) use namespace::derive;
 pub use namespace::{BadNamespace, Namespace};
 pub use object::{ByteStream, Meta, Pin, Stored, Usage};
-pub(crate) use records::{RecordCaps, RecordReservation};
+pub(crate) use records::RecordReservation;
 pub(crate) use secret::Secret;
 pub use writer::Writer;

@@ -1,5 +1,6 @@
 //! Quarantine of job records that cannot be read and of damaged structure files. Only an operator removes them.
 
+use std::io;
 use std::sync::atomic::Ordering;
 
 use futures_util::TryStreamExt as _;
@@ -10,7 +11,7 @@ use object_store::{Error, ObjectMeta, ObjectStoreExt as _};
 use super::error::StoreError;
 use super::handle::Store;
 use super::name::Name;
-use crate::telemetry::RECORDS_QUARANTINED;
+use crate::telemetry::{RECORDS_QUARANTINED, shorten};
 
 /// Folder of the quarantine, beside those of the objects.
 pub(super) const QUARANTINE: &str = "quarantine";
@@ -35,8 +36,17 @@ impl Store {
         self.run_to_completion(moved).await
     }
 
+    /// Moves a file whose digest differs into quarantine, under the lock of its name.
+    pub(super) async fn quarantine_damaged(&self, name: &Name) -> Result<(), StoreError> {
+        let differs = io::Error::other("the digest differs");
+        let error = self.0.backend.fail("verify", &shorten(&name.to_string()), &differs);
+        tracing::error!(%error, "a stored file is damaged; moving it into quarantine");
+        self.0.memory.remove(name);
+        self.move_to_quarantine(name).await
+    }
+
     /// Moves an object into quarantine, under the lock of its name.
-    pub(super) async fn move_to_quarantine(&self, name: &Name) -> Result<(), StoreError> {
+    async fn move_to_quarantine(&self, name: &Name) -> Result<(), StoreError> {
         let backend = &self.0.backend;
         match backend.timed(backend.objects().rename(&name.path(), &quarantine_path(name))).await {
             Ok(()) | Err(Error::NotFound { .. }) => {}

@@ -3,23 +3,18 @@
 
 use std::collections::BTreeMap;
 
+use metrics::counter;
+
 use super::error::StoreError;
 use super::handle::Store;
 use super::index::{EvictionCandidate, Use};
 use super::name::Name;
+use crate::config::JobsConfig;
 use crate::surface::{Exceeded, Limit};
+use crate::telemetry::STORE_REMOVED;
 
 /// Jobs that share a cap: those of one client, see [`Name::owner`], or all.
 pub(super) type Scope = Option<u32>;
-
-/// Caps on the number of jobs on record.
-#[derive(Debug, Clone, Copy)]
-pub(crate) struct RecordCaps {
-    /// Jobs of all clients.
-    pub(crate) total: usize,
-    /// Jobs of one client.
-    pub(crate) per_client: usize,
-}
 
 /// Jobs of a scope.
 #[derive(Debug, Default)]
@@ -69,22 +64,21 @@ impl JobRecords {
 
     /// Returns the first scope of a new job that is at its cap, with the cap and the records of its ended jobs, oldest
     /// first.
-    pub(super) fn at_cap(&self, name: &Name, caps: RecordCaps) -> Option<(Scope, usize, impl Iterator<Item = &Name>)> {
-        scopes(name).into_iter().zip([caps.per_client, caps.total]).find_map(|(scope, cap)| {
+    pub(super) fn at_cap(&self, name: &Name, caps: &JobsConfig) -> Option<(Scope, usize, impl Iterator<Item = &Name>)> {
+        scopes(name).into_iter().zip([caps.records_per_client, caps.records]).find_map(|(scope, cap)| {
             let jobs = self.0.get(&scope)?;
             (jobs.count >= cap).then_some((scope, cap, jobs.ended.values()))
         })
     }
 }
 
-/// Outcome of an attempt to admit a job.
-#[derive(Debug, PartialEq, Eq)]
-pub(super) enum Admission {
-    Admitted,
-    /// The record of this ended job must be removed first.
-    Remove(EvictionCandidate),
-    /// All jobs of the scope are open. The cap.
-    Full(Scope, usize),
+/// Error of a job that a cap does not admit.
+#[derive(Debug)]
+pub(super) struct AtCap {
+    pub(super) scope: Scope,
+    pub(super) limit: usize,
+    /// Record of an ended job that must be removed first. `None` if all jobs of the scope are open.
+    pub(super) oldest: Option<EvictionCandidate>,
 }
 
 /// Reservation of a job below the caps, until its record is written.
@@ -108,27 +102,24 @@ impl Store {
     pub(crate) async fn admit_record(
         &self,
         name: &Name,
-        caps: RecordCaps,
+        caps: &JobsConfig,
     ) -> Result<(RecordReservation, Vec<Name>), StoreError> {
         let mut removed = Vec::new();
         loop {
-            let admission = self.index().admit_record(name, caps);
-            match admission {
-                Admission::Admitted => {
-                    return Ok((RecordReservation { store: self.clone(), name: name.clone() }, removed));
+            let admitted = self.index().admit_record(name, caps);
+            let Err(AtCap { scope, limit, oldest }) = admitted else {
+                return Ok((RecordReservation { store: self.clone(), name: name.clone() }, removed));
+            };
+            let Some(oldest) = oldest else {
+                let mut error = Exceeded::new(Limit::JobRecords, limit as u64);
+                if scope.is_none() {
+                    (error.subject, error.is_fixed) = ("the service".into(), true);
                 }
-                Admission::Full(scope, limit) => {
-                    let mut error = Exceeded::new(Limit::JobRecords, limit as u64);
-                    if scope.is_none() {
-                        (error.subject, error.is_fixed) = ("the service".into(), true);
-                    }
-                    return Err(StoreError::TooManyRecords(error.into()));
-                }
-                Admission::Remove(candidate) => {
-                    if self.evict_record(&candidate).await? {
-                        removed.extend(candidate.names);
-                    }
-                }
+                return Err(StoreError::TooManyRecords(error.into()));
+            };
+            if self.remove_candidate(&oldest).await? {
+                counter!(STORE_REMOVED, "reason" => "records").increment(1);
+                removed.extend(oldest.names);
             }
         }
     }

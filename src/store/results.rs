@@ -1,15 +1,12 @@
 //! Check of stored results. A result is compared with its digest before its first use in a process, and again whenever
 //! its file has changed since.
 
-use std::io;
-
 use super::digest::{Digest, Hasher};
 use super::error::StoreError;
 use super::handle::Store;
 use super::name::Name;
 use super::object::Meta;
 use crate::sync::spawn_blocking;
-use crate::telemetry::shorten;
 
 /// Number of results that are known to be intact, in a few megabytes. Others are checked again.
 pub(super) const INTACT_RESULTS: usize = 16_384;
@@ -69,11 +66,7 @@ impl Store {
                 store.0.intact.insert(name, meta);
                 return Ok(true);
             }
-            let error = io::Error::other("the digest differs");
-            let error = store.0.backend.fail("verify", &shorten(&name.to_string()), &error);
-            tracing::error!(%error, "a stored result is damaged; moving it into quarantine");
-            store.0.memory.remove(&name);
-            store.move_to_quarantine(&name).await?;
+            store.quarantine_damaged(&name).await?;
             Ok(false)
         })
         .await

@@ -1,12 +1,14 @@
 //! Random secret of a store, created once.
 
-use std::fs::{File, OpenOptions};
 use std::io::{self, Write as _};
 use std::path::Path as FilePath;
 
 use bytes::Bytes;
 use object_store::path::Path;
 use object_store::{ObjectStore, ObjectStoreExt as _, PutMode};
+use tempfile::Builder;
+
+use super::lock::sync_folder;
 
 /// Name of the secret in the root of the store, outside the folders that are cleaned up.
 const NAME: &str = "secret";
@@ -29,22 +31,15 @@ pub(super) fn in_folder(root: &FilePath) -> io::Result<Secret> {
 fn create_in_folder(root: &FilePath) -> io::Result<Secret> {
     let (path, fresh) = (root.join(NAME), random()?);
     // The name appears with the complete content. Of processes that create it at once, one succeeds.
-    let staged = root.join(format!(".{NAME}.{}.tmp", unique()?));
-    let mut options = OpenOptions::new();
-    options.write(true).create(true).truncate(true);
-    #[cfg(unix)]
-    std::os::unix::fs::OpenOptionsExt::mode(&mut options, 0o600);
-    let mut file = options.open(&staged)?;
-    file.write_all(&fresh)?;
-    file.sync_all()?;
-    let linked = std::fs::hard_link(&staged, &path);
-    std::fs::remove_file(&staged)?;
-    match linked {
+    let prefix = format!(".{NAME}.");
+    let mut staged = Builder::new().prefix(&prefix).suffix(".tmp").tempfile_in(root)?;
+    staged.write_all(&fresh)?;
+    staged.as_file().sync_all()?;
+    match staged.persist_noclobber(&path).map_err(|refused| refused.error) {
         Err(error) if error.kind() == io::ErrorKind::AlreadyExists => return secret(&std::fs::read(&path)?),
-        linked => linked?,
+        persisted => drop(persisted?),
     }
-    #[cfg(unix)]
-    File::open(root)?.sync_all()?;
+    sync_folder(root)?;
     Ok(fresh)
 }
 

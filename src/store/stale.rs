@@ -1,8 +1,11 @@
 //! Leftovers of crashed processes.
 
 use std::io;
-use std::path::PathBuf;
+use std::path::Path;
 use std::time::{Duration, SystemTime};
+
+use super::backend::CHECK;
+use super::name::Folder;
 
 /// Age at which unfinished objects are abandoned; no job takes that long. Younger ones may belong to another process,
 /// as during a rolling restart.
@@ -13,11 +16,12 @@ pub(super) fn is_stale(written: SystemTime, now: SystemTime) -> bool {
     now.duration_since(written).is_ok_and(|age| age >= STALE)
 }
 
-/// Removes abandoned staged files from `folders`. Their name is that of the object, with `#` and a number. Blocks.
-pub(super) fn clear_files(folders: &[PathBuf], now: SystemTime) -> io::Result<u64> {
+/// Removes abandoned staged files of the store in `root`. Their name is that of the object, with `#` and a number.
+/// Blocks.
+pub(super) fn clear_files(root: &Path, now: SystemTime) -> io::Result<u64> {
     let mut removed = 0;
-    for folder in folders {
-        for entry in std::fs::read_dir(folder)? {
+    for folder in Folder::ALL.map(Folder::as_str).into_iter().chain([CHECK]) {
+        for entry in std::fs::read_dir(root.join(folder))? {
             let entry = entry?;
             let name = entry.file_name();
             let staged = name.to_str().and_then(|name| name.rsplit_once('#'));

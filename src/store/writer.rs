@@ -4,6 +4,7 @@ use std::io;
 
 use bytes::{Bytes, BytesMut};
 
+use super::digest::{Digest, Hasher};
 use super::error::StoreError;
 use super::eviction::SpaceReservation;
 use super::handle::Store;
@@ -20,6 +21,7 @@ pub struct Writer {
     name: Name,
     reservation: SpaceReservation,
     filling: BytesMut,
+    hasher: Hasher,
     /// Upload in parts, from the first full part on.
     upload: Option<ObjectUpload>,
     /// Total size of the uploaded parts, bytes.
@@ -38,6 +40,7 @@ impl Store {
             name: name.clone(),
             reservation: self.empty_reservation(name),
             filling: BytesMut::new(),
+            hasher: Hasher::default(),
             upload: None,
             uploaded: 0,
             failed: false,
@@ -46,16 +49,17 @@ impl Store {
 }
 
 impl Writer {
-    /// Makes the object visible. It is durable on return.
+    /// Makes the object visible. It is durable on return. Returns its size, bytes, and its digest.
     ///
     /// # Errors
     /// Returns a [`StoreError`]. The object is not visible then.
-    pub fn finish(mut self) -> Result<(), StoreError> {
+    pub fn finish(mut self) -> Result<(u64, Digest), StoreError> {
         let runtime = self.store.0.runtime.clone();
-        runtime.block_on(self.complete())
+        let size = runtime.block_on(self.complete())?;
+        Ok((size, std::mem::take(&mut self.hasher).digest()))
     }
 
-    async fn complete(&mut self) -> Result<(), StoreError> {
+    async fn complete(&mut self) -> Result<u64, StoreError> {
         let last = self.filling.split().freeze();
         if self.failed {
             return Err(StoreError::WriterFailed);
@@ -69,12 +73,13 @@ impl Writer {
         if let Some(upload) = self.upload.take() {
             upload.finish().await?;
             self.store.commit(&self.name, self.uploaded, None, &mut self.reservation);
-        } else {
-            // An object of one part needs no multipart upload, and may be cached.
-            self.store.0.backend.put(&self.name, last.clone(), false).await?;
-            self.store.commit(&self.name, last.len() as u64, Some(&last), &mut self.reservation);
+            return Ok(self.uploaded);
         }
-        Ok(())
+        // An object of one part needs no multipart upload, and may be cached.
+        let size = last.len() as u64;
+        self.store.0.backend.put(&self.name, last.clone(), false).await?;
+        self.store.commit(&self.name, size, Some(&last), &mut self.reservation);
+        Ok(size)
     }
 
     /// Uploads a part. Aborts the upload if that fails.
@@ -111,6 +116,7 @@ impl io::Write for Writer {
         }
         let taken = bytes.len().min(part - self.filling.len());
         self.filling.extend_from_slice(&bytes[..taken]);
+        self.hasher.update(&bytes[..taken]);
         if self.filling.len() == part {
             let full = std::mem::take(&mut self.filling).freeze();
             let runtime = self.store.0.runtime.clone();

@@ -329,7 +329,7 @@ async fn objects_over_the_capacity_are_rejected(mut place: TestStore) {
             let mut writer = store.writer(&result(2));
             move || {
                 writer.write_all(&noise(1001, 1)).unwrap();
-                writer.finish()
+                writer.finish().map(drop)
             }
         })
         .await,

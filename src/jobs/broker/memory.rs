@@ -2,15 +2,14 @@
 
 use std::collections::{BTreeMap, HashMap, HashSet};
 use std::sync::{Arc, PoisonError};
-use std::time::Duration;
 
 use futures_util::future::BoxFuture;
 use futures_util::stream::{self, BoxStream, StreamExt as _};
 use metrics::gauge;
 use tokio::sync::{Notify, broadcast};
 
-use super::order::{QUEUES, QueueOrder};
-use super::{Broker, Claim, Dispatch, DispatchError, JobEvent, Lease, WorkLock};
+use super::order::QueueOrder;
+use super::{Broker, Claim, ClaimEnd, Dispatch, DispatchError, JobEvent, WorkLock};
 use crate::jobs::record::JobId;
 use crate::store::Digest;
 use crate::sync::{Handle, Mutex, MutexGuard, sleep};
@@ -20,7 +19,7 @@ use crate::telemetry::BROKER_QUEUED;
 const EVENTS: usize = 256;
 
 /// Place of a job that the broker holds.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 struct Place {
     queue: usize,
     /// Number in the order of dispatch.
@@ -29,35 +28,33 @@ struct Place {
 
 #[derive(Debug, Default)]
 struct BrokerState {
-    /// Queued jobs of each queue by number.
-    queues: [BTreeMap<u64, JobId>; QUEUES.len()],
+    /// Queued jobs, queue by queue.
+    queued: BTreeMap<Place, JobId>,
     order: QueueOrder,
     /// All jobs that are queued, delayed or claimed.
     held: HashMap<JobId, Place>,
     /// Work that is being done.
     locked: HashSet<Digest>,
     next: u64,
-    /// Number of queued jobs.
-    waiting: usize,
 }
 
 impl BrokerState {
     fn enqueue(&mut self, id: JobId, place: Place) {
-        self.queues[place.queue].insert(place.number, id);
-        self.count(self.waiting + 1);
+        self.queued.insert(place, id);
+        self.publish();
     }
 
     fn take(&mut self, prefers_gpu: bool) -> Option<JobId> {
-        let order = self.order.next(prefers_gpu);
-        let (queue, id) = order.into_iter().find_map(|queue| Some((queue, self.queues[queue].pop_first()?.1)))?;
-        self.order.claimed(queue);
-        self.count(self.waiting - 1);
-        Some(id)
+        let first = |queue| self.queued.range(Place { queue, number: 0 }..=Place { queue, number: u64::MAX }).next();
+        let place = self.order.next(prefers_gpu).into_iter().find_map(|queue| first(queue).map(|(place, _)| *place))?;
+        self.order.claimed(place.queue);
+        let id = self.queued.remove(&place);
+        self.publish();
+        id
     }
 
-    fn count(&mut self, waiting: usize) {
-        self.waiting = waiting;
-        gauge!(BROKER_QUEUED).set(u32::try_from(waiting).unwrap_or(u32::MAX));
+    fn publish(&self) {
+        gauge!(BROKER_QUEUED).set(u32::try_from(self.queued.len()).unwrap_or(u32::MAX));
     }
 }
 
@@ -78,10 +75,22 @@ impl BrokerShared {
     fn take(&self, prefers_gpu: bool) -> Option<JobId> {
         let mut state = self.lock();
         let taken = state.take(prefers_gpu);
-        if taken.is_some() && state.waiting > 0 {
+        if taken.is_some() && !state.queued.is_empty() {
             self.filled.notify_one();
         }
         taken
+    }
+
+    /// Ends a claim, which lasts as long as the process otherwise.
+    fn end(self: Arc<Self>, id: JobId, end: ClaimEnd) {
+        match end {
+            ClaimEnd::Done | ClaimEnd::Abandon => drop(self.lock().held.remove(&id)),
+            ClaimEnd::Release(delay) if delay.is_zero() => self.requeue(id),
+            ClaimEnd::Release(delay) => drop(Handle::current().spawn(async move {
+                sleep(delay).await;
+                self.requeue(id);
+            })),
+        }
     }
 
     fn requeue(&self, id: JobId) {
@@ -118,41 +127,12 @@ impl MemoryBroker {
     }
 }
 
-/// Claim of a job of a [`MemoryBroker`]. It lasts as long as the process.
-struct MemoryLease {
-    broker: Arc<BrokerShared>,
-    id: JobId,
-}
-
-impl Lease for MemoryLease {
-    fn done(self: Box<Self>) -> BoxFuture<'static, ()> {
-        self.broker.lock().held.remove(&self.id);
-        Box::pin(std::future::ready(()))
-    }
-
-    fn abandon(self: Box<Self>) {
-        self.broker.lock().held.remove(&self.id);
-    }
-
-    fn release(self: Box<Self>, delay: Duration) {
-        let Self { broker, id } = *self;
-        if delay.is_zero() {
-            broker.requeue(id);
-            return;
-        }
-        Handle::current().spawn(async move {
-            sleep(delay).await;
-            broker.requeue(id);
-        });
-    }
-}
-
 impl Broker for MemoryBroker {
     fn dispatch<'a>(&'a self, job: &'a Dispatch) -> BoxFuture<'a, Result<bool, DispatchError>> {
         let mut state = self.0.lock();
         let queued = if state.held.contains_key(&job.id) {
             Ok(false)
-        } else if state.waiting >= self.0.limit {
+        } else if state.queued.len() >= self.0.limit {
             Err(DispatchError::Full)
         } else {
             let place = Place { queue: job.queue(), number: state.next };
@@ -173,8 +153,11 @@ impl Broker for MemoryBroker {
             loop {
                 let filled = self.0.filled.notified();
                 if let Some(id) = self.0.take(prefers_gpu) {
-                    let lease = MemoryLease { broker: Arc::clone(&self.0), id: id.clone() };
-                    return Claim::new(id, lease);
+                    let (broker, claimed) = (Arc::clone(&self.0), id.clone());
+                    return Claim::new(id, move |end| {
+                        broker.end(claimed, end);
+                        Box::pin(std::future::ready(()))
+                    });
                 }
                 filled.await;
             }
@@ -216,7 +199,7 @@ impl Broker for MemoryBroker {
     }
 
     fn queued(&self) -> usize {
-        self.0.lock().waiting
+        self.0.lock().queued.len()
     }
 
     fn limit(&self) -> usize {

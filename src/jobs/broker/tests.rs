@@ -14,7 +14,7 @@ use std::time::{Duration, Instant};
 use futures_util::StreamExt as _;
 use tokio::runtime::Runtime;
 
-use super::{Broker, Claim, Dispatch, DispatchError, JobEvent, MemoryBroker, NatsBroker};
+use super::{Broker, Claim, ClaimEnd, Dispatch, DispatchError, JobEvent, JobProgress, MemoryBroker, NatsBroker};
 use crate::config::BrokerConfig;
 use crate::jobs::rank::DEFAULT_URGENCY;
 use crate::jobs::record::JobId;
@@ -31,6 +31,13 @@ const SOON: Duration = Duration::from_secs(5);
 const LEASE: Duration = Duration::from_secs(2);
 /// Maximum number of jobs.
 const LIMIT: usize = 40;
+
+impl Claim {
+    /// Ends the claim of a job that has ended.
+    pub(crate) async fn done(self) {
+        self.end(ClaimEnd::Done).await;
+    }
+}
 
 /// Broker that several nodes share.
 enum Shared {
@@ -272,7 +279,7 @@ async fn a_returned_job_is_claimed_again_after_its_delay() {
         drop(claim(&broker).await);
         let claimed = claim(&broker).await;
         assert_eq!(claimed.id, job.id);
-        claimed.release(Duration::from_millis(700));
+        claimed.end(ClaimEnd::Release(Duration::from_millis(700))).await;
         none_within(&broker, Duration::from_millis(300)).await;
         let claimed = claim(&broker).await;
         assert_eq!(claimed.id, job.id);
@@ -342,7 +349,8 @@ async fn followers_get_the_events_of_their_job() {
         let mut events = b.events(&job.id).await;
         // A subscription takes effect after a round trip.
         tokio::time::sleep(Duration::from_millis(100)).await;
-        let running = JobEvent::Running { attempts: 2, started_ms: Some(7), stage: "field".into(), fraction: 0.25 };
+        let progress = JobProgress { attempts: 2, started_ms: Some(7), stage: "field".into(), fraction: 0.25 };
+        let running = JobEvent::Running(progress);
         a.publish(&other.id, JobEvent::Ended);
         a.publish(&job.id, running.clone());
         let mut next = async || tokio::time::timeout(SOON, events.next()).await.expect("an event");

@@ -9,7 +9,7 @@ use shuttle::rand::{Rng as _, thread_rng};
 use tokio::sync::watch;
 
 use super::SCHEDULES;
-use crate::jobs::broker::{Broker, Claim, Dispatch, MemoryBroker};
+use crate::jobs::broker::{Broker, Claim, ClaimEnd, Dispatch, MemoryBroker};
 use crate::jobs::record::JobId;
 use crate::store::Digest;
 use crate::sync::thread;
@@ -34,7 +34,7 @@ fn run(broker: &MemoryBroker, claim: Claim, counts: &RunCounts, returns_early: b
     let (runs, _) = change(counts, &id, |(runs, _)| *runs += 1);
     assert_eq!(runs, 1, "two workers run a job");
     if returns_early {
-        claim.release(Duration::ZERO);
+        block_on(claim.end(ClaimEnd::Release(Duration::ZERO)));
         thread::yield_now();
         change(counts, &id, |(runs, _)| *runs -= 1);
         return;
@@ -51,7 +51,7 @@ fn run(broker: &MemoryBroker, claim: Claim, counts: &RunCounts, returns_early: b
     if ends {
         block_on(claim.done());
     } else {
-        claim.release(Duration::ZERO);
+        block_on(claim.end(ClaimEnd::Release(Duration::ZERO)));
     }
 }
 

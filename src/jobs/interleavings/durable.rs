@@ -23,7 +23,7 @@ use super::task;
 use crate::config::JobsConfig;
 use crate::formats::Format;
 use crate::store::interleavings::open_bytes;
-use crate::store::{Hasher, Name, Namespace, Store};
+use crate::store::{Digest, Name, Namespace, Store};
 use crate::surface::{OutOfMemory, ReferenceBackend};
 use crate::sync::thread::{self, JoinHandle};
 
@@ -98,7 +98,7 @@ impl Fixture {
         let arithmetic = self.jobs.0.pool.file_arithmetics(&entry.task.options).remove(0);
         let key =
             ContentKey::new(&entry.task.digest, &entry.task.options, Format::Glb, &arithmetic, Namespace::default());
-        let report = results::report_file(b"{}".to_vec(), &Hasher::default(), 0).unwrap();
+        let report = results::report_file(b"{}".to_vec(), 0, Digest::of(b"")).unwrap();
         for (extension, bytes) in [("glb", Bytes::new()), (REPORT, report)] {
             block_on(self.store.put(&key.name(extension).unwrap(), bytes)).unwrap();
         }
@@ -203,7 +203,7 @@ impl Client<'_> {
         let Some(job) = self.fixture.jobs.0.lock().jobs.get(&id()).cloned() else { return };
         if job.end(Status::Dismissed, |_| {}) {
             job.publish_end(job.record());
-            job.stop().notify_one();
+            job.stop();
             block_on(self.fixture.jobs.0.write_job(&job)).unwrap();
         }
     }

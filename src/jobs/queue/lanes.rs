@@ -42,12 +42,8 @@ impl Queue {
         job.on_start.extend(on_start);
         (job.begun, job.cancel) = (None, CancelToken::default());
         job.progress.restart();
-        let worker = state.enqueue(at, Lane::Long);
+        state.enqueue(at, Lane::Long);
         self.publish(&mut state);
-        drop(state);
-        if let Some(worker) = worker {
-            worker.notify_one();
-        }
         None
     }
 }

@@ -208,10 +208,11 @@ async fn a_later_attempt_of_another_node_supersedes_an_earlier_one() {
     job.adopt(record);
     assert!(!a.jobs.is_superseded(&job).await, "control: the same attempt");
     // A node of a later release.
-    let (stop, is_followed) = (job.stop(), || a.jobs.0.lock().jobs.contains_key(&id));
+    let owned = a.jobs.0.lock().own(&job).expect("no other run");
+    let is_followed = || a.jobs.0.lock().jobs.contains_key(&id);
     assert!(!a.jobs.refresh(&job).await && is_followed(), "control: this release can read the record");
     b.store.put(&name, Bytes::from_static(br#"{"version":2}"#)).await.unwrap();
     assert!(a.jobs.is_superseded(&job).await);
     assert!(a.jobs.refresh(&job).await && !is_followed(), "the job is left to that node");
-    tokio::time::timeout(MAX_WAIT, stop.notified()).await.expect("the own run stops");
+    tokio::time::timeout(MAX_WAIT, owned.stop.notified()).await.expect("the own run stops");
 }

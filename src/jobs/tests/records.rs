@@ -9,7 +9,7 @@ use super::{Fixture, MAX_WAIT, ended, new_id, until};
 use crate::config::JobsConfig;
 use crate::jobs::broker::{Broker as _, Dispatch};
 use crate::jobs::durable_job::DurableJob;
-use crate::jobs::job_store::MAX_ENDED;
+use crate::jobs::job_map::MAX_ENDED;
 use crate::jobs::record::{JobRecord, now_ms};
 use crate::jobs::{AcceptError, JobId, Status};
 use crate::store::{Folder, Name, Namespace, StoreError};
@@ -54,7 +54,7 @@ async fn few_ended_jobs_stay_in_memory() {
     let record = fixture.on_record(&open).await;
     let insert = |record: JobRecord| {
         let id = record.id.clone();
-        fixture.jobs.0.insert(&id, &Arc::new(DurableJob::new(record)));
+        fixture.jobs.0.lock().insert(&Arc::new(DurableJob::new(record)));
         id
     };
     insert(record.clone());

@@ -10,8 +10,7 @@ use futures_util::StreamExt as _;
 use metrics::counter;
 use tokio::time::{Instant, timeout, timeout_at};
 
-use super::lease::NatsLease;
-use super::{NatsState, POLL, Queue, REQUEST, RequestKind, lock};
+use super::{NatsState, POLL, Queue, REQUEST, RequestKind, lease, lock};
 use crate::jobs::broker::order::{QUEUES, suits_gpu};
 use crate::jobs::broker::{Claim, Dispatch};
 use crate::telemetry::BROKER_REDELIVERIES;
@@ -169,7 +168,7 @@ impl NatsState {
             let (message, acker) = message.split();
             if let Some(id) = message.subject.as_str().rsplit('.').next().and_then(|id| id.parse().ok()) {
                 let interval = Duration::from_millis(self.config.lease_ms / 3);
-                return Ok(Some(Claim::new(id, NatsLease::start(acker, interval, self.endings.clone()))));
+                return Ok(Some(Claim::new(id, lease::extend(acker, interval, self.endings.clone()))));
             }
             drop(acker.ack_with(AckKind::Term).await);
         }

@@ -61,21 +61,14 @@ impl NatsState {
             *lock(&self.queues) = None;
             return Err(format!("the stream {name} is that of another store: check store.url and broker.prefix"));
         }
-        let missing = match &found {
-            Err(error) => Some(format!("the stream {name}: {error}")),
-            Ok(info) if info.state.consumer_count < QUEUES.len() => {
-                Some(format!("the stream {name} has {} of {} consumers", info.state.consumer_count, QUEUES.len()))
-            }
-            Ok(_) if !has_locks => Some(format!("the stream {} is missing", self.locks())),
-            Ok(_) => None,
-        };
-        let info = match (found, missing) {
-            (Ok(info), None) if self.queues().is_some() => info,
-            (_, missing) => {
-                let existed = self.queues().is_some();
+        let existed = self.queues().is_some();
+        let info = match found {
+            Ok(info) if existed && has_locks && info.state.consumer_count >= QUEUES.len() => info,
+            found => {
                 let info = self.create().await?;
-                if let Some(missing) = missing.filter(|_| existed) {
-                    tracing::warn!(missing, "created streams or consumers of the broker that were lost");
+                if existed {
+                    let consumers = found.map_or(0, |info| info.state.consumer_count);
+                    tracing::warn!(consumers, has_locks, "created streams or consumers of the broker that were lost");
                 }
                 info
             }

@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 use futures_util::StreamExt as _;
 
-use super::super::{Broker, Dispatch, NatsBroker, check_broker};
+use super::super::{Broker, ClaimEnd, Dispatch, NatsBroker, check_broker};
 use super::{MAX_WAIT, SOON, claim, job, nats, none_within, on_nats, until_down};
 use crate::config::BrokerConfig;
 use crate::jobs::rank::DEFAULT_URGENCY;
@@ -105,7 +105,7 @@ async fn a_broker_that_comes_back_is_used_again() {
             assert_eq!(broker.dispatch(&queued).await, Ok(!keeps_data));
             let claimed = claim(&broker).await;
             assert_eq!(claimed.id, queued.id);
-            claimed.release(Duration::ZERO);
+            claimed.end(ClaimEnd::Release(Duration::ZERO)).await;
         }
     })
     .await;
