@@ -179,6 +179,7 @@ mod tests {
 
     use super::super::args::{Args, Command};
     use super::*;
+    use molmesh::pipeline::params::Domain;
 
     fn request(flags: &[&str]) -> Result<Request, CliError> {
         let line = ["molmesh", "mesh", "in.pdb", "-o", "out.glb"].iter().chain(flags);
@@ -208,46 +209,36 @@ mod tests {
     fn every_parameter_has_a_flag() {
         for parameter in params::TABLE {
             let flag = format!("--{}", parameter.name.replace('_', "-"));
+            let example = match parameter.domain {
+                Domain::Choice(words) => words.iter().copied().find(|word| !parameter.is_default(word)).unwrap(),
+                _ => "2",
+            };
             let value = match parameter.name {
                 "atom_ids" | "check" | "pockets" => vec![flag.as_str()],
-                "validation" => vec![&flag, "exact"],
-                "quality" => vec![&flag, "high"],
-                "cavities" => vec![&flag, "drop"],
                 "tile" => vec![&flag, "1/0/1/0"],
                 "pocket_probe" => vec![&flag, "5", "--pockets"],
-                "compress" => vec![&flag, "quantize"],
-                "normals" => vec![&flag, "none"],
-                "units" => vec![&flag, "nanometer"],
                 "instances" => vec![&flag, "--assembly", "1"],
                 "unit" => vec![&flag, "1", "--assembly", "1"],
-                "context" => vec![&flag, "whole"],
-                "split" => vec![&flag, "chain"],
                 "max_triangles" => vec![&flag, "5000"],
-                "surface" => vec![&flag, "soft-object"],
                 "probe" => vec![&flag, "2", "--surface", "ses"],
                 "exact" => vec![&flag, "--surface", "ses"],
                 "interface" => vec![&flag, "A,B", "--exact", "--surface", "ses"],
-                "preset" => vec![&flag, "blinn"],
                 "select" => vec![&flag, "water"],
-                "format" => vec![&flag, "ply"],
                 "paper_a" => vec![&flag, "1", "--paper-b", "2"],
                 "paper_b" => vec![&flag, "2", "--paper-a", "1"],
                 "paper_c" => vec![&flag, "0.5", "--paper-b", "3", "--surface", "inverse-square"],
                 "radius_offset" => vec![&flag, "-0.1"],
                 "cutoff_tolerance" => vec![&flag, "0.02"],
-                "view" => vec![&flag, "top"],
                 "background" => vec![&flag, "#102030"],
-                "style" => vec![&flag, "gouraud"],
                 "color" => vec![&flag, "bfactor"],
-                "palette" => vec![&flag, "cividis", "--color", "bfactor"],
-                "color_blend" => vec![&flag, "smooth", "--color", "chain"],
+                "palette" => vec![&flag, example, "--color", "bfactor"],
+                "color_blend" => vec![&flag, example, "--color", "chain"],
                 "color_offset" => vec![&flag, "2", "--color", "map"],
                 "color_range" => vec![&flag, "0,50", "--color", "bfactor"],
-                _ => vec![&flag, "2"],
+                _ => vec![&flag, example],
             };
             let key = |r: &Request| (params::canonical(&r.options), r.format, r.strict);
-            let pictures = parameter.doc.contains("picture") && parameter.name != "format";
-            let ask = if pictures { drawn } else { request };
+            let ask = if params::PICTURES.contains(&parameter.name) { drawn } else { request };
             let changed = ask(&value).unwrap_or_else(|e| panic!("{value:?}: {e}"));
             assert_ne!(key(&changed), key(&ask(&[]).unwrap()), "{flag} changes nothing");
             // A parameter that changes the mesh changes the picture.

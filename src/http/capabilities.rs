@@ -107,8 +107,7 @@ struct ParameterDocument {
     expected: String,
     /// Default value, in words.
     default: &'static str,
-    /// Type of the values: `number`, `integer`, `boolean`, `choice` (one of `values`), `set` (one or more of `values`,
-    /// separated by commas) or `text`.
+    /// Type of the values: `number`, `integer`, `boolean`, `choice` (one of `values`) or `text`.
     r#type: &'static str,
     /// Smallest value; numbers and integers only.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -122,7 +121,7 @@ struct ParameterDocument {
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schema(nullable = false)]
     unit: Option<&'static str>,
-    /// Allowed values; choices and sets only.
+    /// Allowed values; choices only.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schema(nullable = false)]
     values: Option<&'static [&'static str]>,

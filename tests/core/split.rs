@@ -154,7 +154,7 @@ fn every_rule_names_its_parts() {
 fn bad_values_name_the_valid_ones() {
     let error = params::parse([("split", "atom")]).unwrap_err();
     assert!(matches!(error, ParamError::BadValue { name: "split", .. }), "{error}");
-    assert!(error.to_string().contains("none, chain, entity, residue-group"), "{error}");
+    assert!(error.to_string().contains("none, chain, entity, residue-group, pocket"), "{error}");
     let key = |value| params::canonical(&params::parse([("split", value)]).unwrap().options);
     let none = params::canonical(&params::parse::<&str, &str>([]).unwrap().options);
     let keys = ["none", "chain", "entity", "residue-group"].map(key);

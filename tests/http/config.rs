@@ -2,6 +2,7 @@
 
 use std::path::Path;
 
+use crate::defaults::choices;
 use molmesh::config::{Config, ConfigError, LogFormat, load};
 use molmesh::pipeline::params::{Domain, ParamError, TABLE, canonical, parse};
 
@@ -237,9 +238,8 @@ fn canonical_texts_differ_exactly_if_the_jobs_differ() {
         assert_eq!(text(same), plain, "{same:?}");
     }
     let mut seen = vec![plain];
-    for other in [
+    let others = [
         &[("resolution", "0.51")][..],
-        &[("preset", "blinn")],
         &[("select", "polymer,ligand")],
         &[("select", "all")],
         &[("select", "polymer,hydrogens")],
@@ -250,20 +250,9 @@ fn canonical_texts_differ_exactly_if_the_jobs_differ() {
         &[("model", "2")],
         &[("altloc", "B")],
         &[("assembly", "1")],
-        &[("context", "whole")],
         &[("instances", "true"), ("assembly", "1")],
         &[("unit", "1"), ("assembly", "1")],
-        &[("split", "chain")],
-        &[("split", "entity")],
-        &[("split", "residue-group")],
         &[("atom_ids", "true")],
-        &[("validation", "exact")],
-        &[("quality", "high")],
-        &[("compress", "quantize")],
-        &[("compress", "meshopt")],
-        &[("normals", "none")],
-        &[("units", "nanometer")],
-        &[("units", "meter")],
         // The same spacing for a small structure, different ones for a large one.
         &[("detail", "4")],
         &[("detail", "3")],
@@ -271,13 +260,11 @@ fn canonical_texts_differ_exactly_if_the_jobs_differ() {
         &[("max_triangles", "40001")],
         &[("paper_a", "1"), ("paper_b", "2")],
         &[("paper_a", "2"), ("paper_b", "1")],
-        &[("surface", "inverse-square")],
-        &[("surface", "vdw")],
-        &[("surface", "sas")],
-        &[("surface", "ses")],
         &[("surface", "ses"), ("probe", "1.5")],
-    ] {
-        let text = text(other);
+    ];
+    let choices = choices().into_iter().filter(|other| other[0].0 != "check");
+    for other in others.into_iter().map(<[_]>::to_vec).chain(choices) {
+        let text = text(&other);
         assert!(!seen.contains(&text), "{other:?}");
         seen.push(text);
     }

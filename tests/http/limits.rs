@@ -279,7 +279,7 @@ fn parts_of_an_assembly_are_named_by_chain_and_copy() {
     assert_eq!(names, ["A-1", "A-2", "A-3", "A-4", "A-5", "A-6"]);
     let bad = server.post("/v1/meshes?split=atom", &[], text.as_bytes()).problem(400, "bad-parameter");
     assert_eq!(bad["parameter"], "split");
-    assert!(bad["expected"].as_str().unwrap().contains("none, chain, entity, residue-group"), "{bad}");
+    assert!(bad["expected"].as_str().unwrap().contains("none, chain, entity, residue-group, pocket"), "{bad}");
     let none = server.post("/v1/meshes?split=entity", &[], text.as_bytes()).problem(400, "bad-parameter");
     assert_eq!((&none["parameter"], &none["value"]), (&"split".into(), &"entity".into()));
 }

@@ -166,6 +166,7 @@ fn estimates_and_capabilities_support_spacing_parameters() {
     assert_eq!([&detail["type"], &detail["min"], &detail["max"]], [&json!("integer"), &json!(0), &json!(6)]);
     assert_eq!(parameter("max_triangles")["min"], 8);
     assert_eq!(parameter("normals")["values"], json!(["smooth", "none"]));
+    assert_eq!(parameter("split")["values"], json!(["none", "chain", "entity", "residue-group", "pocket"]));
     assert_eq!(parameter("units")["values"], json!(["angstrom", "nanometer", "meter"]));
 }
 

@@ -3,8 +3,8 @@
 use std::sync::Arc;
 
 use molmesh_surface::{
-    Backend, BackendIdentity, BackendJob, Control, DeviceStatus, MeshOutput, Spheres, Stage, SurfaceError, SurfaceLimits,
-    SurfaceParams, backend::one_atom,
+    Backend, BackendIdentity, BackendJob, Control, DeviceStatus, MeshOutput, Spheres, Stage, SurfaceError,
+    SurfaceLimits, SurfaceParams, backend::one_atom,
 };
 
 use super::device_queue::single_line;

@@ -138,22 +138,31 @@ impl Options {
         self.params.atom_ids || self.color.is_some_and(|color| !matches!(color.scheme, Scheme::Vertex(_)))
     }
 
-    /// Returns true if the mesh can be written while it is computed. Atom ids, colours, the exact validation, a limit
-    /// on triangles, parts, cuts, instances, removed components, compression, simplification, improved triangles and
-    /// pictures need the whole mesh in memory.
+    /// Returns true if nothing needs the whole mesh in memory. Without `..`, so that a new field must be considered.
     fn can_stream(&self) -> bool {
-        !self.params.atom_ids
-            && self.color.is_none()
-            && self.validation == Validation::Checksum
-            && self.spacing.max_triangles().is_none()
-            && self.compress != Compress::Meshopt
-            && self.simplify.is_none()
-            && self.quality == TriangleQuality::Standard
-            && self.split == Split::None
-            && self.selection.context == Context::Selection
-            && !self.selection.instances
-            && self.cavities.is_none_or(|cavities| cavities == Cavities::Keep)
-            && self.picture.is_none()
+        matches!(
+            self,
+            Self {
+                selection: Selection { context: Context::Selection, instances: false, .. },
+                params: SurfaceParams { atom_ids: false, .. },
+                split: Split::None,
+                cavities: None | Some(Cavities::Keep),
+                simplify: None,
+                quality: TriangleQuality::Standard,
+                spacing: Spacing::Given | Spacing::Detail(_),
+                validation: Validation::Checksum,
+                compress: Compress::None | Compress::Quantize,
+                color: None,
+                picture: None,
+                tile: _,
+                pockets: _,
+                normals: _,
+                units: _,
+                map: _,
+                exact: _,
+                interface: _,
+            }
+        )
     }
 
     /// Returns the limit on triangles, which applies to the choice of the grid spacing or to the simplification.
@@ -387,6 +396,5 @@ fn mesh(
         estimate::check_memory(&plan, options, control)?;
         clock.pass(|| meshing.mesh(&before_simplifying, control))
     };
-    let output = written.map_err(|error| plan.run_error(error, control))?;
-    Ok(JobMesh { output, params, tries: None })
+    Ok(JobMesh { output: written.map_err(|error| plan.run_error(error, control))?, params, tries: None })
 }

@@ -22,6 +22,7 @@ use molmesh_surface::{SurfaceError, SurfaceParams, TriangleQuality};
 pub use table::{Parameter, TABLE, usual_range};
 use values::ParsedValues;
 
+use super::color::{Coloring, Scheme};
 use super::nearest::nearest;
 use super::{Cavities, Interface, Options, Simplify, tileset};
 
@@ -111,10 +112,15 @@ pub fn parse_with<N: AsRef<str>, V: AsRef<str>, E: From<ParamError>>(
     pairs: impl IntoIterator<Item = (N, V)>,
     format: impl FnOnce(&Options) -> Result<Format, E>,
 ) -> Result<Request, E> {
-    let mut values = parse_values(pairs)?;
+    let values = parse_values(pairs)?;
     let format = values.format.map_or_else(|| format(&values.options), Ok)?;
-    set_format(&mut values.options, format)?;
-    Ok(Request { options: values.options, format, strict: values.strict })
+    Ok(request(values, format)?)
+}
+
+/// Returns the request for a file of this format.
+fn request(ParsedValues { mut options, strict, .. }: ParsedValues, format: Format) -> Result<Request, ParamError> {
+    set_format(&mut options, format)?;
+    Ok(Request { options, format, strict })
 }
 
 /// Parses parameters of a tileset, whose tiles are GLB files, compressed by default. Adds this default to the pairs.
@@ -125,9 +131,10 @@ pub fn parse_tileset(pairs: &mut Vec<(String, String)>) -> Result<Request, Param
     if pairs.iter().all(|(name, _)| name != "compress") {
         pairs.push(("compress".to_owned(), Compress::Meshopt.name().to_owned()));
     }
-    let request = parse_with(pairs.iter().map(|(name, value)| (name, value)), |_| Ok::<_, ParamError>(Format::Glb))?;
-    tileset::check(&request.options)?;
-    Ok(request)
+    let values = parse_values(pairs.iter().map(|(name, value)| (name, value)))?;
+    check_tiles(&values)?;
+    let format = values.format.unwrap_or(Format::Glb);
+    request(values, format)
 }
 
 /// Parses parameters and checks them, apart from the format.
@@ -155,6 +162,9 @@ fn parse_values<N: AsRef<str>, V: AsRef<str>>(
             continue;
         }
         values.set(parameter, value)?;
+        if tileset::NOT_APPLICABLE.contains(&parameter.name) {
+            values.unfit_for_tiles.get_or_insert((parameter.name, value.to_owned()));
+        }
         if SPACINGS.contains(&parameter.name) {
             spacings.push((parameter.name, value.to_owned()));
         }
@@ -174,9 +184,24 @@ fn parse_values<N: AsRef<str>, V: AsRef<str>>(
     check_exact(options)?;
     check_simplify(options)?;
     if options.tile.is_some() {
-        tileset::check(options)?;
+        check_tiles(&values)?;
     }
     Ok(values)
+}
+
+/// Rejects parameters that do not apply to tiles.
+fn check_tiles(values: &ParsedValues) -> Result<(), ParamError> {
+    let Options { color, split, .. } = &values.options;
+    let (name, value, expected) = match (color, &values.unfit_for_tiles) {
+        (Some(Coloring { scheme: scheme @ Scheme::Vertex(_), .. }), _) => {
+            ("color", &scheme.to_string(), "a scheme that colours atoms")
+        }
+        (_, Some((name, value))) => (*name, value, "no value, or the default,"),
+        _ if *split == Split::Model => ("model", &"all".to_owned(), "one model"),
+        _ => return Ok(()),
+    };
+    let expected = format!("{expected} for a tileset, whose tiles are computed independently");
+    Err(ParamError::bad_value(name, value, expected))
 }
 
 /// Rejects a unit without an assembly, and instances without one, with one unit, or with a surface that is divided or

@@ -29,8 +29,8 @@ pub enum Split {
     Pocket,
 }
 
-named!(Split, None => "none", Chain => "chain", Entity => "entity", Model => "model", ResidueGroup => "residue-group",
-    Pocket => "pocket");
+named!(Split, None => "none", Chain => "chain", Entity => "entity", ResidueGroup => "residue-group", Pocket => "pocket";
+    Model => "model");
 
 impl Split {
     /// Returns the parameter that divides the surface, with its value.

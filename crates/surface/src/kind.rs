@@ -79,10 +79,11 @@ pub enum Preset {
     Quicksurf,
 }
 
-/// Implements names and [`Display`](std::fmt::Display) for an enum of named values.
+/// Implements names and [`Display`](std::fmt::Display) for an enum of named values. A value after the semicolon is not
+/// a value of the parameter.
 #[macro_export]
 macro_rules! named {
-    ($type:ident, $($variant:ident => $name:literal),+) => {
+    ($type:ident, $($variant:ident => $name:literal),+ $(; $implied:ident => $implied_name:literal)?) => {
         impl $type {
             /// Every value, in documentation order.
             pub const ALL: [Self; Self::NAMES.len()] = [$(Self::$variant),+];
@@ -92,7 +93,7 @@ macro_rules! named {
             /// Returns the name of the value in parameters, reports and files.
             #[must_use]
             pub const fn name(self) -> &'static str {
-                match self { $(Self::$variant => $name),+ }
+                match self { $(Self::$variant => $name,)+ $(Self::$implied => $implied_name)? }
             }
 
             /// Returns the value with this name.

@@ -65,21 +65,13 @@ fn schema(parameter: &params::Parameter) -> RefOr<Schema> {
     }
 }
 
-/// Describes a parameter with its unit, range and default.
+/// Describes a parameter with its valid values and its default.
 fn describe(parameter: &params::Parameter) -> String {
-    let range = match parameter.domain {
-        Domain::Number { min, max, unit: "" } => format!(" Range: {min} to {max}."),
-        Domain::Number { min, max, unit } => format!(" Range: {min} to {max} {unit}."),
-        Domain::Integer { min, max } => format!(" Range: {min} to {max}."),
-        Domain::Text { expected } => format!(" Value: {expected}."),
-        _ => String::new(),
-    };
-    let default = match parameter.default {
-        "absent" => String::new(),
-        default if parameter.name == "format" => format!(" Default: the format that `Accept` prefers, or {default}."),
-        default => format!(" Default: {default}."),
-    };
-    format!("{}{range}{default}", parameter.doc)
+    let text = parameter.describe();
+    if parameter.name != "format" {
+        return text;
+    }
+    text.replace("Default: ", "Default: the format that `Accept` prefers, or ")
 }
 
 /// Returns the `x-control` extension, from which front ends build controls: `unit`, `usual` (the range of a slider),

@@ -27,6 +27,19 @@ pub struct Parameter {
 }
 
 impl Parameter {
+    /// Returns the description with the valid values and the default.
+    #[must_use]
+    pub fn describe(&self) -> String {
+        let values = match self.domain {
+            Domain::Number { min, max, unit } => format!(" Range: {}.", format!("{min} to {max} {unit}").trim_end()),
+            Domain::Integer { min, max } => format!(" Range: {min} to {max}."),
+            Domain::Choice(_) | Domain::Text { .. } => format!(" Value: {}.", self.domain.expected()),
+            Domain::Flag => String::new(),
+        };
+        let default = Some(self.default).filter(|default| *default != "absent");
+        format!("{}{values}{}", self.doc, default.map_or(String::new(), |default| format!(" Default: {default}.")))
+    }
+
     /// Returns the error for a value that is not valid.
     pub(super) fn invalid(&self, value: &str) -> ParamError {
         ParamError::bad_value(self.name, value, self.domain.expected())
@@ -90,9 +103,6 @@ pub fn usual_range(parameter: &Parameter) -> Option<[f64; 2]> {
         _ => [min, max],
     })
 }
-
-/// Documented values of `split`.
-const SPLITS: &[&str] = &[Split::None.name(), Split::Chain.name(), Split::Entity.name(), Split::ResidueGroup.name()];
 
 /// All parameters in documentation order. A test checks that the bounds equal those of
 /// [`molmesh_surface::SurfaceParams::new`].
@@ -167,7 +177,7 @@ pub const TABLE: &[Parameter] = &[
         "Constant b of Dias, Bora and Gomes 2010. gaussian: height; soft-object and inverse-square: radius of support in Å, 0.1 to 50.",
     ),
     number("paper_c", [1e-6, 1.0], "Å²", "absent", "Constant C of Dias, Bora and Gomes 2010; inverse-square only."),
-    switch("atom_ids", "Store the index of the nearest atom with every vertex."),
+    switch("atom_ids", "Stores the index of the nearest atom with every vertex: `_ATOM` in glTF, `atom` in PLY."),
     switch("exact", "Adds exact areas and volume to the report, in total and by chain; surface=vdw, sas and ses only."),
     Parameter {
         name: "interface",
@@ -256,7 +266,7 @@ pub const TABLE: &[Parameter] = &[
     },
     Parameter {
         name: "split",
-        domain: Domain::Choice(SPLITS),
+        domain: Domain::Choice(Split::NAMES),
         default: "none",
         doc: "Divides the mesh into parts that are closed on their own: chain (per copy in an assembly), entity, or residue-group (polymer, ligand, glycan, ion, water). With context=whole, divides the triangles of one surface by their nearest atoms. pocket divides the triangles of one surface by the pockets that they line.",
     },
@@ -294,7 +304,7 @@ pub const TABLE: &[Parameter] = &[
         name: "quality",
         domain: Domain::Choice(TriangleQuality::NAMES),
         default: "standard",
-        doc: "Quality of the triangles: high improves those of marching cubes, so that few have small angles. Not with simplify.",
+        doc: "Quality of the triangles: high improves those of marching cubes, so that few have small angles; this takes 10 to 50 times as long as meshing. Not with simplify.",
     },
     Parameter {
         name: "validation",
@@ -306,7 +316,7 @@ pub const TABLE: &[Parameter] = &[
         name: "check",
         domain: Domain::Choice(&["strict"]),
         default: "absent",
-        doc: "strict rejects a file in which the strict validator finds errors.",
+        doc: "Rejects a file in which the strict validator finds errors, and reports its other findings.",
     },
     Parameter {
         name: "format",

@@ -33,6 +33,8 @@ pub(super) struct ParsedValues {
     pockets: bool,
     pocket_probe: Option<f64>,
     max_triangles: Option<u64>,
+    /// First parameter that does not apply to tiles, with its value.
+    pub(super) unfit_for_tiles: Option<(&'static str, String)>,
     pub(super) options: Options,
     pub(super) format: Option<Format>,
     pub(super) strict: bool,
@@ -181,7 +183,7 @@ impl ParsedValues {
             "instances" => options.selection.instances = flag(text).ok_or_else(bad)?,
             "unit" => options.selection.unit = Some(number_of_unit(parameter, text).ok_or_else(bad)?),
             "context" => options.selection.context = Context::named(text).ok_or_else(bad)?,
-            "split" => options.split = Split::named(text).filter(|split| *split != Split::Model).ok_or_else(bad)?,
+            "split" => options.split = Split::named(text).ok_or_else(bad)?,
             "cavities" => options.cavities = Some(Cavities::named(text).ok_or_else(bad)?),
             "pockets" => self.pockets = flag(text).ok_or_else(bad)?,
             "pocket_probe" => self.pocket_probe = Some(bounded().ok_or_else(bad)?),

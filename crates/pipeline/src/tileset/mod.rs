@@ -17,14 +17,13 @@ use std::fmt;
 use std::ops::Deref;
 use std::sync::Arc;
 
-use molmesh_formats::Units;
 use molmesh_formats::tileset::{TileAddress, TilesetBounds};
-use molmesh_structure::{Context, ReadLimits, Selected, Split, Structure, StructureError};
+use molmesh_structure::{ReadLimits, Selected, Structure, StructureError};
 use molmesh_surface::clip::{influence, influence_of};
 use molmesh_surface::params::bad;
 use molmesh_surface::{
     Backend, Control, Exceeded, GridStats, Limit, Measures, Mesh, MeshOutput, Spheres, Stage, SurfaceError,
-    SurfaceLimits, SurfaceParams, TriangleQuality, Validation,
+    SurfaceLimits, SurfaceParams,
 };
 
 use self::layout::Layout;
@@ -33,9 +32,8 @@ use self::source::{LevelSource, NearSpheres, Streamed};
 pub use self::stream::{StreamSource, StructureStream, check_stream, needs_memory};
 pub use self::units::AssemblyTileset;
 pub use self::write::{LevelReport, TilesetReport, UnitReport, WriteError, unit_folder, write, write_stream};
-use super::color::{ColorBlend, ColorReport, Coloring, MeshColors, MeshedSurface, Scheme};
+use super::color::{ColorReport, Coloring, MeshColors, MeshedSurface};
 use super::load::{LoadedStructure, load};
-use super::params::ParamError;
 use super::report::Counts;
 use super::{Choice, JobError, Options, Product, Report, StageClock, WorkScope};
 
@@ -73,53 +71,12 @@ impl<S> fmt::Debug for Tileset<S> {
     }
 }
 
-/// Parameters that do not apply to tiles.
+/// Parameters that do not apply to tiles, which are computed independently.
 #[rustfmt::skip]
 pub const NOT_APPLICABLE: [&str; 17] = [
     "split", "context", "cavities", "pockets", "pocket_probe", "exact", "interface", "max_triangles",
     "simplify", "quality", "units", "paper_a", "paper_b", "paper_c", "validation", "color_blend", "color_offset",
 ];
-
-/// Rejects parameters of a job that do not apply to tiles.
-///
-/// # Errors
-/// Returns [`ParamError::BadValue`].
-pub(super) fn check(options: &Options) -> Result<(), ParamError> {
-    let selection = &options.selection;
-    let when = |is_refused: bool, value: &str| is_refused.then(|| value.to_owned());
-    let of_vertices = |color: &Coloring| matches!(color.scheme, Scheme::Vertex(_));
-    let refused = [
-        ("split", when(options.split != Split::None && options.split != Split::Model, options.split.name()), "none"),
-        ("model", when(options.split == Split::Model, "all"), "one model"),
-        ("context", when(selection.context != Context::Selection, selection.context.name()), "selection"),
-        ("cavities", options.cavities.map(|cavities| cavities.name().to_owned()), "no value"),
-        (
-            "color",
-            options.color.filter(of_vertices).map(|color| color.scheme.to_string()),
-            "a scheme that colours atoms",
-        ),
-        (
-            "color_blend",
-            when(options.color.is_some_and(|color| color.blend == ColorBlend::Smooth), "smooth"),
-            "nearest",
-        ),
-        ("pockets", when(options.pockets.is_some(), "true"), "false"),
-        ("exact", when(options.exact, "true"), "false"),
-        ("max_triangles", options.max_triangles().map(|limit| limit.to_string()), "no value"),
-        ("simplify", options.simplify.map(|wanted| wanted.error.to_string()), "no value"),
-        ("quality", when(options.quality != TriangleQuality::Standard, options.quality.name()), "standard"),
-        ("units", when(options.units != Units::Angstrom, options.units.name()), "angstrom"),
-        ("paper_b", when(options.params.paper.is_some(), "a raw constant"), "no value"),
-        ("validation", when(options.validation != Validation::default(), options.validation.name()), "checksum"),
-    ];
-    match refused.into_iter().find_map(|(name, value, expected)| Some((name, value?, expected))) {
-        Some((name, value, expected)) => {
-            let expected = format!("{expected} for a tileset, whose tiles are computed independently");
-            Err(ParamError::bad_value(name, &value, expected))
-        }
-        None => Ok(()),
-    }
-}
 
 impl<S: Deref<Target = Structure>> Tileset<S> {
     /// Prepares the levels of the structure that `read` returns. The grid spacing of `options` is that of the last
