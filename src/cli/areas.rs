@@ -2,7 +2,7 @@
 
 use molmesh::pipeline::areas::measure_selection;
 use molmesh::pipeline::params::areas::AreasRequest;
-use molmesh::pipeline::{LeftOutReport, MeasuredSelection, Options, SelectionMeasures};
+use molmesh::pipeline::{LeftOut, MeasuredSelection, Options, SelectionMeasures};
 use molmesh::structure::{self, Structure};
 use molmesh::surface::{CancelToken, Control, Limit};
 use serde::Serialize;
@@ -81,7 +81,7 @@ struct AreasReport<'a> {
     id: Option<&'a str>,
     /// Number of atoms in the table, with all copies of an assembly.
     atoms: usize,
-    left_out: &'a LeftOutReport,
+    left_out: &'a LeftOut,
     warnings: &'a [String],
     surface: &'static str,
     /// Radius of the probe, Å; null for a surface without one.

@@ -1,8 +1,8 @@
 //! Summary of a report, as text of at most one screen.
 
 use molmesh::pipeline::{
-    AssemblyReport, CavityReport, ColorReport, ExactReport, InstancesReport, LeftOutReport, PictureReport,
-    PocketReport, Report, SimplificationReport, TriangleReport,
+    AssemblyReport, CavityReport, ColorReport, ExactReport, InstancesReport, LeftOut, PictureReport, PocketReport,
+    Report, SimplificationReport, TriangleReport,
 };
 use molmesh::structure::strict_validator::Diagnostic;
 use molmesh::surface::Validation;
@@ -135,8 +135,8 @@ fn repeated(report: &Report, instances: &InstancesReport) -> String {
 }
 
 /// Formats the numbers of atoms that were left out, by residue name and reason, if there are any.
-pub(super) fn left_out(left_out: &LeftOutReport) -> Option<String> {
-    let LeftOutReport {
+pub(super) fn left_out(left_out: &LeftOut) -> Option<String> {
+    let LeftOut {
         total,
         other_blocks,
         spheres,
@@ -317,12 +317,12 @@ mod tests {
             models: None,
             assembly: None,
             instances: None,
-            left_out: LeftOutReport {
+            left_out: LeftOut {
                 total: 60,
                 virtual_sites: 2,
                 residues: vec![ResidueCount { name: "HOH".into(), kind: "water", atoms: 53 }],
                 hydrogens: 5,
-                ..LeftOutReport::default()
+                ..LeftOut::default()
             },
             warnings: vec!["line 9, column 55: found `   inf`; read as 1".into()],
             radii: "table",

@@ -8,13 +8,13 @@
 macro_rules! section {
     (
         $(#[$attribute:meta])* $section:ident;
-        $($(#[$attribute_of_key:meta])* $key:ident: $type:ty = $default:expr;)+
+        $($(#[$key_attribute:meta])* $key:ident: $type:ty = $default:expr;)+
     ) => {
         $(#[$attribute])*
         #[derive(Debug, Clone, PartialEq, serde::Serialize, serde::Deserialize, schemars::JsonSchema)]
         #[serde(deny_unknown_fields, default)]
         pub struct $section {
-            $($(#[$attribute_of_key])* pub $key: $type,)+
+            $($(#[$key_attribute])* pub $key: $type,)+
         }
 
         impl Default for $section {

@@ -19,13 +19,15 @@ pub fn schema() -> Value {
     schema["title"] = "Configuration of molmesh".into();
     schema["description"] =
         "The file that `molmesh serve --config FILE` reads. All keys are optional; unknown keys are rejected.".into();
-    for (section, of_section) in schema["properties"].as_object_mut().into_iter().flatten() {
-        let Some(of_section) = of_section.as_object_mut() else { continue };
-        of_section.remove("default");
-        one_line(of_section);
-        for (key, of_key) in of_section.get_mut("properties").and_then(Value::as_object_mut).into_iter().flatten() {
-            if let Some(of_key) = of_key.as_object_mut() {
-                finish(&format!("{section}.{key}"), of_key, &defaults[section][key]);
+    for (section, section_schema) in schema["properties"].as_object_mut().into_iter().flatten() {
+        let Some(section_schema) = section_schema.as_object_mut() else { continue };
+        section_schema.remove("default");
+        one_line(section_schema);
+        for (key, key_schema) in
+            section_schema.get_mut("properties").and_then(Value::as_object_mut).into_iter().flatten()
+        {
+            if let Some(key_schema) = key_schema.as_object_mut() {
+                finish(&format!("{section}.{key}"), key_schema, &defaults[section][key]);
             }
         }
     }
@@ -33,14 +35,14 @@ pub fn schema() -> Value {
 }
 
 /// Adapts the schema of a key to the loader: optional values, sizes, minimum and default.
-fn finish(key: &str, of_key: &mut Map<String, Value>, default: &Value) {
-    one_line(of_key);
-    let absent = drop_null(of_key);
+fn finish(key: &str, key_schema: &mut Map<String, Value>, default: &Value) {
+    one_line(key_schema);
+    let absent = drop_null(key_schema);
     // Formats such as uint64 are not standard.
-    of_key.remove("format");
-    let of_type = |of_key: &Map<String, Value>, name: &str| of_key.get("type").is_some_and(|kind| kind == name);
-    if of_type(of_key, "integer") {
-        of_key.insert("minimum".to_owned(), minimum(key).into());
+    key_schema.remove("format");
+    let of_type = |key_schema: &Map<String, Value>, name: &str| key_schema.get("type").is_some_and(|kind| kind == name);
+    if of_type(key_schema, "integer") {
+        key_schema.insert("minimum".to_owned(), minimum(key).into());
         let texts = match (key.ends_with("_bytes"), absent) {
             (true, false) => Some(SIZE.to_owned()),
             (true, true) => Some(format!("{SIZE}|^none$")),
@@ -48,31 +50,31 @@ fn finish(key: &str, of_key: &mut Map<String, Value>, default: &Value) {
             (false, false) => None,
         };
         if let Some(pattern) = texts {
-            of_key.insert("type".to_owned(), json!(["integer", "string"]));
-            of_key.insert("pattern".to_owned(), pattern.into());
+            key_schema.insert("type".to_owned(), json!(["integer", "string"]));
+            key_schema.insert("pattern".to_owned(), pattern.into());
         }
     }
-    if let Some(Value::Array(kinds)) = of_key.get_mut("anyOf")
+    if let Some(Value::Array(kinds)) = key_schema.get_mut("anyOf")
         && absent
     {
         kinds.push(json!({ "const": "none" }));
     }
-    of_key.remove("default");
+    key_schema.remove("default");
     let default = if default.is_null() { json!("none") } else { default.clone() };
-    of_key.insert("default".to_owned(), default);
+    key_schema.insert("default".to_owned(), default);
 }
 
 /// Removes `null` from the schema of a key, because TOML has none. Returns true if the key is optional.
-fn drop_null(of_key: &mut Map<String, Value>) -> bool {
+fn drop_null(key_schema: &mut Map<String, Value>) -> bool {
     let (key, null) =
-        if of_key.contains_key("anyOf") { ("anyOf", json!({ "type": "null" })) } else { ("type", json!("null")) };
-    let Some(Value::Array(kinds)) = of_key.get_mut(key) else { return false };
+        if key_schema.contains_key("anyOf") { ("anyOf", json!({ "type": "null" })) } else { ("type", json!("null")) };
+    let Some(Value::Array(kinds)) = key_schema.get_mut(key) else { return false };
     let before = kinds.len();
     kinds.retain(|kind| *kind != null);
     let absent = kinds.len() < before;
     if let [one] = kinds.as_slice() {
         let one = one.clone();
-        of_key.insert(key.to_owned(), one);
+        key_schema.insert(key.to_owned(), one);
     }
     absent
 }
@@ -95,13 +97,16 @@ mod tests {
         for (section, keys) in defaults.as_object().unwrap() {
             assert_eq!(schema["properties"][section]["additionalProperties"], false, "{section}");
             for (key, default) in keys.as_object().unwrap() {
-                let of_key = &schema["properties"][section]["properties"][key];
-                let text = of_key["description"].as_str().unwrap_or_default();
+                let key_schema = &schema["properties"][section]["properties"][key];
+                let text = key_schema["description"].as_str().unwrap_or_default();
                 assert!(text.contains("Default"), "{section}.{key} has no default: {text}");
-                assert!(!text.contains('\n') && !of_key.to_string().contains("null"), "{section}.{key}: {of_key}");
+                assert!(
+                    !text.contains('\n') && !key_schema.to_string().contains("null"),
+                    "{section}.{key}: {key_schema}"
+                );
                 let unit = if key.ends_with("_ms") { "ms" } else { "" };
                 assert!(text.contains(unit), "{section}.{key} has no unit: {text}");
-                assert_eq!(of_key["default"], if default.is_null() { json!("none") } else { default.clone() });
+                assert_eq!(key_schema["default"], if default.is_null() { json!("none") } else { default.clone() });
             }
         }
     }
@@ -111,8 +116,8 @@ mod tests {
         let schema = schema();
         let mut secret = Vec::new();
         for (section, keys) in schema["properties"].as_object().unwrap() {
-            for (key, of_key) in keys["properties"].as_object().unwrap() {
-                if of_key["writeOnly"] == true {
+            for (key, key_schema) in keys["properties"].as_object().unwrap() {
+                if key_schema["writeOnly"] == true {
                     secret.push(format!("{section}.{key}"));
                     assert!(keys["properties"].get(format!("{key}_file")).is_some(), "{section}.{key}");
                 }

@@ -118,20 +118,20 @@ pub(super) async fn create(
     let digest = source.digest(&app, &caller).await?;
     let Loaded { input, digest, reservation } = source.find(&app, &caller, &digest, None).await?;
     drop(source);
-    let (seconds, lane) = (app.pool.expected(&input, &options), Pool::lane(&Rank::default(), &input, &options));
+    let (expected, lane) = (app.pool.expected(&input, &options), Pool::lane(&Rank::default(), &input, &options));
     let backend = app.pool.choice(&input, &options).backend.name();
     let reading = app.read(&caller, (reservation, delivery), {
         let (app, options, namespace) = (Arc::clone(&app), options.clone(), caller.namespace);
         move |control| {
             let choice = app.pool.choice(&input, &options);
             let limits = app.config.limits.job();
-            let read = |control: &Control<'_>| app.structures().get(namespace, digest, &input, &limits.read, control);
+            let read = |control: &Control<'_>| app.structures().get((namespace, digest), &input, &limits.read, control);
             pipeline::estimate(read, &options, &limits, &choice, control)
         }
     });
     let estimate = reading.await?.map_err(|error| declared.explain(error.into()))?;
     // The estimate from the file size does not include the copies in an assembly.
-    let guess = seconds * estimate.atoms as f64 / estimate.distinct_atoms as f64;
+    let guess = expected.as_secs_f64() * estimate.atoms as f64 / estimate.distinct_atoms as f64;
     let seconds = estimate.work(&options).map_or(guess, |units| app.pool.seconds(units));
     let wait = app.pool.estimated_wait(lane).as_secs_f64();
     let mesh = estimate.mesh.as_ref().ok();

@@ -257,7 +257,7 @@ fn answer(status: StatusCode, view: &JobView, wait: Option<Duration>) -> Respons
         headers.insert(header::LOCATION, delivery::text(&format!("/v1/jobs/{}", view.record.id.as_str())));
     }
     if !view.record.status.is_final() {
-        let seconds = wait.map_or(1, |wait| (wait + Duration::from_millis(999)).as_secs().clamp(1, 600));
+        let seconds = wait.map_or(1, |wait| wait.saturating_add(Duration::from_millis(999)).as_secs().clamp(1, 600));
         headers.insert(header::RETRY_AFTER, HeaderValue::from(seconds));
     }
     response

@@ -258,8 +258,8 @@ impl MeshRequest {
         // A client that disconnects now does not interrupt the acceptance.
         let accepted = tokio::spawn(async move { job_store.accept(spec, ticket).await }.in_current_span());
         let view = accepted.await.map_err(Problem::internal)??;
-        let duration = Duration::from_secs_f64(app.pool.expected(&loaded.input, &parsed.request.options));
-        let mut response = jobs::accepted(&view, app.pool.estimated_wait(Lane::Batch) + duration);
+        let expected = app.pool.expected(&loaded.input, &parsed.request.options);
+        let mut response = jobs::accepted(&view, app.pool.estimated_wait(Lane::Batch).saturating_add(expected));
         if preferences.respond_async {
             response.headers_mut().insert(PREFERENCE_APPLIED, HeaderValue::from_static("respond-async"));
         }

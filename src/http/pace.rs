@@ -12,7 +12,7 @@ use std::task::{Context, Poll, Waker, ready};
 use std::time::Duration;
 
 use axum::body::Body;
-use axum::http::header::CONTENT_TYPE;
+use axum::http::header::{CONTENT_LENGTH, CONTENT_TYPE};
 use axum::http::{Response, Version};
 use bytes::Bytes;
 use hyper::body::{Body as HttpBody, Frame, SizeHint};
@@ -161,7 +161,8 @@ impl Pace {
     pub(super) fn watch(answer: Response<Body>, connection: &Arc<Self>, version: Version) -> Response<Body> {
         let is_http2 = version == Version::HTTP_2;
         let limit = if is_http2 { 0 } else { SMALL };
-        let is_small = answer.body().size_hint().upper().is_some_and(|bytes| bytes <= limit);
+        let stated = answer.headers().get(CONTENT_LENGTH).and_then(|length| length.to_str().ok()?.parse().ok());
+        let is_small = stated.or(answer.body().size_hint().upper()).is_some_and(|bytes| bytes <= limit);
         let is_events =
             answer.headers().get(CONTENT_TYPE).is_some_and(|t| t.as_bytes().starts_with(b"text/event-stream"));
         if is_small || is_events {

@@ -89,7 +89,8 @@ impl Problem {
 
     /// Sets `Retry-After`, 1 to 600 s.
     pub(super) fn retry_after(mut self, wait: Duration) -> Self {
-        self.retry_after_s = u32::try_from((wait + Duration::from_millis(999)).as_secs().clamp(1, 600)).ok();
+        self.retry_after_s =
+            u32::try_from(wait.saturating_add(Duration::from_millis(999)).as_secs().clamp(1, 600)).ok();
         self
     }
 

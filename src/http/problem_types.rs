@@ -11,7 +11,7 @@ pub(super) struct ProblemEntry {
     /// `type` of the problems, and the path of this document.
     pub(super) r#type: &'static str,
     /// HTTP status of the problems.
-    #[serde(serialize_with = "number")]
+    #[serde(serialize_with = "serialize_status")]
     #[schema(value_type = u16, minimum = 400, maximum = 599)]
     pub(super) status: StatusCode,
     /// Short summary.
@@ -29,7 +29,7 @@ pub(super) struct ProblemEntry {
 }
 
 #[expect(clippy::trivially_copy_pass_by_ref, reason = "the signature that serde requires")]
-fn number<S: Serializer>(status: &StatusCode, serializer: S) -> Result<S::Ok, S::Error> {
+fn serialize_status<S: Serializer>(status: &StatusCode, serializer: S) -> Result<S::Ok, S::Error> {
     serializer.serialize_u16(status.as_u16())
 }
 

@@ -71,7 +71,7 @@ impl Loaded {
         let (structures, namespace) = (app.structures(), caller.namespace);
         let Self { input, digest, reservation: file } = self;
         let listing = app.read(caller, (file, delivery), move |control| {
-            let structure = structures.get(namespace, digest, &input, &limits, control).map_err(|mut error| {
+            let structure = structures.get((namespace, digest), &input, &limits, control).map_err(|mut error| {
                 if let StructureError::Limit(exceeded) = &mut error {
                     exceeded.is_fixed |= is_fixed && exceeded.limit == Limit::Atoms;
                 }
@@ -119,7 +119,7 @@ impl StructureSource {
         options: Option<&Options>,
     ) -> Result<Loaded, Problem> {
         let namespace = caller.namespace;
-        match (self, app.structures().find(namespace, *digest, options)) {
+        match (self, app.structures().find((namespace, *digest), options)) {
             (Self::Stored(_) | Self::Entry(_), Some(input)) => {
                 if let Self::Stored(_) = self {
                     app.store.touch(&Name::input(digest).within(namespace), app.store.now());

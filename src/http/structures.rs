@@ -223,7 +223,7 @@ async fn summarize(
     let (structures, namespace) = (app.structures(), caller.namespace);
     let Loaded { input, digest, reservation } = loaded;
     let parsing = app.read(caller, (reservation, delivery), move |control| {
-        let kept = structures.get(namespace, digest, &input, &limits, control)?;
+        let kept = structures.get((namespace, digest), &input, &limits, control)?;
         let _contents = control.reserve(kept.table_bytes())?;
         Ok(summary(&digest, input.file_bytes(), &kept, limits.max_copies))
     });

@@ -190,8 +190,8 @@ impl Preparation<'_> {
 
     /// Returns the tileset of the assembly.
     fn assembly(&self) -> Result<AssemblyTileset<SharedStructure>, Problem> {
-        let Self { app, key: (namespace, digest), input, options, limits, control } = self;
-        let read = |control: &Control<'_>| app.structures().get(*namespace, *digest, input, limits, control);
+        let Self { app, key, input, options, limits, control } = self;
+        let read = |control: &Control<'_>| app.structures().get(*key, input, limits, control);
         let clock = StageClock::new(&());
         let assembly = AssemblyTileset::new(read, options, limits, &WorkScope::new(&clock, control));
         Ok(assembly.map_err(Failure::from)?)

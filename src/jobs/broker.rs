@@ -55,7 +55,7 @@ pub(crate) struct JobProgress {
     pub(crate) attempts: u32,
     /// Start of the attempt, ms since 1970.
     pub(crate) started_ms: Option<u64>,
-    /// Stage.
+    /// Name of the stage.
     pub(crate) stage: Cow<'static, str>,
     /// Finished fraction, from 0 to 1.
     pub(crate) fraction: f64,
@@ -147,7 +147,7 @@ pub(crate) enum ClaimEnd {
     Abandon,
 }
 
-/// Ends a claim. Only the future of [`ClaimEnd::Done`] has to be polled.
+/// Function that ends a claim. The caller may drop the returned future, except for [`ClaimEnd::Done`].
 type EndClaim = Box<dyn FnOnce(ClaimEnd) -> BoxFuture<'static, ()> + Send + Sync>;
 
 /// Claimed job. No other worker gets the job until the claim ends, or until its node has not extended it for a lease. A

@@ -28,7 +28,7 @@ const DUPLICATE: Duration = Duration::from_secs(5);
 const OTHER_RELEASE: Duration = Duration::from_secs(5);
 
 impl JobStore {
-    /// Returns the broker. [`Self::reconcile`] dispatches jobs that it has lost again.
+    /// Returns the broker. [`Self::reconcile`] dispatches again the jobs that the broker has lost.
     pub(crate) fn broker(&self) -> &dyn Broker {
         self.0.broker.as_ref()
     }
@@ -44,8 +44,9 @@ impl JobStore {
     pub(super) fn queue_full(&self, task: &Task) -> Refusal {
         let (waiting, limit, pool) = (self.0.broker.queued(), self.0.broker.limit(), &self.0.pool);
         // As if the jobs ahead took as long as this one.
-        let ahead = pool.expected(&task.input, &task.options) * waiting as f64 / pool.settings().workers as f64;
-        let wait = pool.estimated_wait(Lane::Batch) + Duration::try_from_secs_f64(ahead).unwrap_or(Duration::MAX);
+        let expected = pool.expected(&task.input, &task.options).as_secs_f64();
+        let ahead = Duration::try_from_secs_f64(expected * waiting as f64 / pool.settings().workers as f64);
+        let wait = pool.estimated_wait(Lane::Batch).saturating_add(ahead.unwrap_or(Duration::MAX));
         Refusal::QueueFull { waiting, limit, wait }
     }
 
@@ -83,7 +84,7 @@ impl JobStore {
             biased;
             record = self.record_of(claim) => match record {
                 Ok(record) => record,
-                Err(end) => return RunEnd::unused(end),
+                Err(end) => return RunEnd::without_record(end),
             },
             () = self.0.runs.reached(Phase::Return) => return RunEnd::returned(Duration::ZERO, true),
         };
@@ -95,14 +96,14 @@ impl JobStore {
             return RunEnd::returned(DUPLICATE, false);
         }
         let owned = self.0.lock().own(&job);
-        let Some(owned) = owned else { return RunEnd::unused(ClaimEnd::Release(DUPLICATE)) };
-        self.0.track(&record);
+        let Some(owned) = owned else { return RunEnd::without_record(ClaimEnd::Release(DUPLICATE)) };
+        self.0.open(record.id.clone(), Ok(Dispatch::of(&record)), self.0.pins(&record));
         job.adopt(record);
         Runner { jobs: self.clone(), owned, ticket: None, slot: Some(slot) }.run().await
     }
 
-    /// Reads the record of a claimed job; the end of the claim if there is no such job for this release. Waits while
-    /// the store fails.
+    /// Reads the record of a claimed job. Returns the end of the claim as an error if the job has ended, is not on
+    /// record or belongs to another release. Waits while the store fails.
     async fn record_of(&self, claim: &Claim) -> Result<JobRecord, ClaimEnd> {
         let mut pause = retry::FIRST_PAUSE;
         loop {

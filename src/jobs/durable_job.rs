@@ -58,7 +58,9 @@ impl DurableJob {
 
     /// Stops the work of the runner of this process, if there is one.
     pub(super) fn stop(&self) {
-        self.signal().iter().for_each(|stop| stop.notify_one());
+        if let Some(stop) = &*self.signal() {
+            stop.notify_one();
+        }
     }
 
     /// Returns true while a runner of this process runs the job.

@@ -41,7 +41,7 @@ fn workers(queue: &Arc<Queue>, runs: &Arc<AtomicUsize>) -> Vec<JoinHandle<()>> {
             while let Some(entry) = queue.pop(lane) {
                 let QueuedTask { id, task, cancel, on_start, .. } = entry;
                 thread::yield_now();
-                if cancel.is_cancelled() && queue.restart(id, task, on_start).is_none() {
+                if cancel.is_cancelled() && queue.restart(id, task, on_start).is_ok() {
                     continue;
                 }
                 runs.fetch_add(1, Ordering::SeqCst);
@@ -97,10 +97,10 @@ fn jobs_that_move_to_the_long_lane_end_although_others_leave_and_the_service_sto
                     thread::spawn(move || push(&queue, n % 2, false).is_ok_and(|ticket| n == 2 || ran(ticket)))
                 })
                 .collect();
-            let of_queue = Arc::clone(&queue);
+            let shared_queue = Arc::clone(&queue);
             requests.push(thread::spawn(move || {
                 for _ in 0..4 {
-                    of_queue.make_room();
+                    shared_queue.make_room();
                     thread::yield_now();
                 }
                 true

@@ -1,5 +1,5 @@
-//! Jobs that this process knows of: those whose state it holds, and all unfinished ones, with what their dispatch needs
-//! and pins of their inputs.
+//! Jobs that this process knows of: those whose state it holds, and all unfinished ones, with their dispatches and the
+//! pins of their inputs.
 
 use std::collections::{BTreeSet, HashMap};
 use std::sync::Arc;
@@ -56,7 +56,8 @@ impl JobMap {
     }
 
     /// Adds an unfinished job whose record is stored, without `dispatch` if another release must run it. `pins` keep
-    /// its inputs and its record. Returns what it replaces, which the caller drops without the lock, as that unpins.
+    /// its inputs and its record. Returns the entry that it replaces. The caller drops it after the lock is released,
+    /// because that unpins.
     pub(super) fn open(&mut self, id: JobId, dispatch: Option<Dispatch>, pins: Vec<Pin>) -> Option<OpenJob> {
         self.next += 1;
         self.open.insert(id, OpenJob { order: self.next, dispatch, _pins: pins })

@@ -240,10 +240,10 @@ impl JobStore {
         Ok(None)
     }
 
-    /// Uses a job in memory, if it is of the namespace, under the lock of the map: it stays in memory while it is
-    /// watched.
-    fn known<T>(&self, id: &JobId, namespace: Namespace, job: impl FnOnce(&Arc<DurableJob>) -> T) -> Option<T> {
-        self.0.lock().jobs.get(id).filter(|job| job.state.borrow().record.namespace == namespace).map(job)
+    /// Calls `use_job` with a job in memory, if it is of the namespace, under the lock of the map. A job that is
+    /// subscribed to there stays in memory.
+    fn known<T>(&self, id: &JobId, namespace: Namespace, use_job: impl FnOnce(&Arc<DurableJob>) -> T) -> Option<T> {
+        self.0.lock().jobs.get(id).filter(|job| job.state.borrow().record.namespace == namespace).map(use_job)
     }
 
     /// Watches the state of a job; `None` if the namespace has no such job.

@@ -28,7 +28,8 @@ pub(super) struct Charged<T> {
     pub(super) atoms: f64,
     /// Memory of the value, bytes.
     pub(super) bytes: u64,
-    /// Charge of the memory. The metric of the budget counts it only if the value is not kept.
+    /// Charge of the memory: the buffers of a value that is kept, else the reservation. The metric of the budget counts
+    /// only the latter.
     pub(super) _charge: Result<Buffers, Arc<MemoryReservation>>,
 }
 
@@ -178,17 +179,14 @@ impl CacheState {
     }
 }
 
-/// Returns the digest of a tileset with its atoms on disk, whose index has the colours.
-pub(super) fn streamed_digest(digest: &Digest, options: &Options) -> Digest {
+/// Returns the digests of a tileset: of its structure file and of the parameters that affect the index. The second one
+/// is that of a tileset with its atoms on disk, whose index has the colours.
+pub(super) fn tileset_digests(digest: &Digest, options: &Options) -> [Digest; 2] {
     let color = options.color.map(|coloring| coloring.canonical());
-    Digest::of(format!("on disk\n{}\n{color:?}", tileset_digest(digest, options)).as_bytes())
-}
-
-/// Returns the digest of a tileset: of its structure file and of the parameters that affect the index.
-pub(super) fn tileset_digest(digest: &Digest, options: &Options) -> Digest {
     let Options { compress, normals, .. } = Options::default();
     let mut options = Options { tile: None, color: None, compress, normals, ..options.clone() };
     options.params.atom_ids = false;
     let canonical = params::canonical(&options);
-    Digest::of(format!("tileset\n{digest}\n{canonical}").as_bytes())
+    let in_memory = Digest::of(format!("tileset\n{digest}\n{canonical}").as_bytes());
+    [in_memory, Digest::of(format!("on disk\n{in_memory}\n{color:?}").as_bytes())]
 }

@@ -1,6 +1,6 @@
 //! The worker pool: a bounded queue in front of one backend, with worker threads of its own, and durable jobs on top.
 //!
-//! The result of a [`Task`] (structure bytes and a [`crate::pipeline::Job`]) is a mesh with its report. Deadlines,
+//! The result of a [`Task`] (structure bytes and a [`crate::pipeline::Options`]) is a mesh with its report. Deadlines,
 //! cancellation and panics are handled here, so callers only wait for a [`Ticket`]. This module knows no HTTP and no
 //! graphics API.
 //!
@@ -91,8 +91,6 @@ pub(crate) struct Finished {
     pub(crate) product: Product,
     /// Findings of the strict validator if the task was strict.
     pub(crate) diagnostics: Option<Vec<Diagnostic>>,
-    /// SHA-256 of the input.
-    pub(crate) digest: Digest,
     /// Memory budget that the mesh is charged to, until this is dropped.
     #[expect(dead_code, reason = "holds the memory until it is dropped")]
     pub(crate) reservation: Arc<MemoryReservation>,

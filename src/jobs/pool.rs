@@ -127,13 +127,16 @@ impl Pool {
         on_start: &mut Option<OnStart>,
     ) -> Result<Option<Ticket>, Refusal> {
         let ticket = self.shared.queue.join(task, allowed, on_start)?;
-        ticket.iter().for_each(count);
+        if let Some(ticket) = &ticket {
+            count(ticket);
+        }
         Ok(ticket)
     }
 
-    /// Estimates the duration of a job on this machine, s, without its time in the queue.
-    pub(crate) fn expected(&self, input: &Input, options: &Options) -> f64 {
-        self.shared.queue.expected(pipeline::estimate_work(input.atoms(), options))
+    /// Estimates the duration of a job on this machine, without its time in the queue.
+    pub(crate) fn expected(&self, input: &Input, options: &Options) -> Duration {
+        let seconds = self.seconds(pipeline::estimate_work(input.atoms(), options));
+        Duration::try_from_secs_f64(seconds).unwrap_or(Duration::MAX)
     }
 
     /// Estimates the duration of `units` of work on this machine, s.

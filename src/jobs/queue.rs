@@ -19,9 +19,26 @@ use super::rank::{Lane, Shares};
 use super::{Outcome, Refusal, Task, Ticket};
 use crate::pipeline;
 use crate::single_flight::{self, ResultReceiver};
+use crate::store::Digest;
 use crate::surface::CancelToken;
 use crate::sync::{Condvar, Mutex, MutexGuard};
 use crate::telemetry::{SpanKind, TraceSpan};
+
+/// Work of a task, computed before the queue is locked.
+#[derive(Clone, Copy)]
+struct TaskWork {
+    key: Digest,
+    /// Expected work, in the units of [`pipeline::estimate_work`].
+    units: f64,
+    lane: Lane,
+}
+
+impl TaskWork {
+    fn of(task: &Task) -> Self {
+        let units = pipeline::estimate_work(task.input.atoms(), &task.options);
+        Self { key: work_key(task), units, lane: Lane::of(&task.rank, units) }
+    }
+}
 
 struct QueueState {
     jobs: Vec<CoalescedJob>,
@@ -64,21 +81,22 @@ impl QueueState {
         let job = &mut self.jobs[at];
         job.lane = lane;
         job.tag = self.shares[lane as usize].tag(job.rank.client, job.units);
-        self.idle_workers[lane as usize].pop().iter().for_each(|worker| worker.notify_one());
+        if let Some(worker) = self.idle_workers[lane as usize].pop() {
+            worker.notify_one();
+        }
     }
 
     /// Creates the job of a task, which is not queued yet.
-    fn job(&mut self, task: &Task) -> CoalescedJob {
+    fn new_job(&mut self, task: &Task, TaskWork { key, units, lane }: TaskWork) -> CoalescedJob {
         self.next_id += 1;
-        let units = pipeline::estimate_work(task.input.atoms(), &task.options);
         let now = Instant::now();
         // A durable job runs after its request was answered.
         let kind = if task.rank.batch { SpanKind::Consumer } else { SpanKind::Internal };
         CoalescedJob {
             id: self.next_id,
-            work: work_key(task),
+            work: key,
             rank: task.rank,
-            lane: Lane::of(&task.rank, units),
+            lane,
             units,
             is_tile: task.options.tile.is_some(),
             tag: 0.0,
@@ -135,16 +153,17 @@ impl Queue {
         allowed: Duration,
         mut on_start: Option<OnStart>,
     ) -> Result<Ticket, Refusal> {
+        let work = TaskWork::of(&task);
         let mut state = self.lock();
-        if let Some(ticket) = self.join_in(&mut state, &task, allowed, &mut on_start)? {
+        if let Some(ticket) = self.join_in(&mut state, &task, work, allowed, &mut on_start)? {
             return Ok(ticket);
         }
-        let mut job = state.job(&task);
-        let (ticket, at, lane) = (self.ticket(&job, allowed), state.jobs.len(), job.lane);
+        let mut job = state.new_job(&task, work);
+        let (ticket, at) = (self.ticket(&job, allowed), state.jobs.len());
         job.on_start.extend(on_start);
         job.task = Some(task);
         state.jobs.push(job);
-        state.enqueue(at, lane);
+        state.enqueue(at, work.lane);
         self.publish(&mut state);
         Ok(ticket)
     }
@@ -157,21 +176,23 @@ impl Queue {
         allowed: Duration,
         on_start: &mut Option<OnStart>,
     ) -> Result<Option<Ticket>, Refusal> {
-        self.join_in(&mut self.lock(), task, allowed, on_start)
+        let work = TaskWork::of(task);
+        self.join_in(&mut self.lock(), task, work, allowed, on_start)
     }
 
     fn join_in(
         self: &Arc<Self>,
         state: &mut QueueState,
         task: &Task,
+        work: TaskWork,
         allowed: Duration,
         on_start: &mut Option<OnStart>,
     ) -> Result<Option<Ticket>, Refusal> {
         if state.closed {
             return Err(Refusal::Draining);
         }
-        let (work, now) = (work_key(task), Instant::now());
-        let same = |job: &CoalescedJob| job.work == work && (job.is_moving || !job.cancel.is_cancelled());
+        let now = Instant::now();
+        let same = |job: &CoalescedJob| job.work == work.key && (job.is_moving || !job.cancel.is_cancelled());
         if let Some(at) = state.jobs.iter().position(same) {
             let joined_running = state.jobs[at].begun.is_some();
             if state.jobs[at].rank.batch && !task.rank.batch {
@@ -194,14 +215,13 @@ impl Queue {
         }
         if state.leaving && task.rank.batch {
             // The next process runs the job. Without a sender the ticket ends as stopped.
-            return Ok(Some(self.ticket(&CoalescedJob { outcome: None, ..state.job(task) }, allowed)));
+            return Ok(Some(self.ticket(&CoalescedJob { outcome: None, ..state.new_job(task, work) }, allowed)));
         }
         // A broker has queued durable jobs; no more are claimed than there are workers.
         if task.rank.batch {
             return Ok(None);
         }
-        let units = pipeline::estimate_work(task.input.atoms(), &task.options);
-        let lane = Lane::of(&task.rank, units);
+        let TaskWork { units, lane, .. } = work;
         let (wait, expected) = (self.wait(state, lane, now), Self::expected_now(state, lane, units, now));
         // A job of a free worker counts as running before the worker has woken up.
         if state.len(lane) >= self.limit + self.workers {

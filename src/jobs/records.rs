@@ -36,8 +36,8 @@ impl JobStoreState {
         Name::job(record.id.as_str()).into_iter().chain(inputs).map(|name| self.store.pin(&name)).collect()
     }
 
-    /// Adds an unfinished job; see [`JobMap::open`](super::job_map::JobMap::open). `dispatch` is the reason if another
-    /// release must run it.
+    /// Adds an unfinished job; see [`JobMap::open`](super::job_map::JobMap::open). An error in `dispatch` is the reason
+    /// why another release must run the job.
     pub(super) fn open(&self, id: JobId, dispatch: Result<Dispatch, String>, pins: Vec<Pin>) {
         if let Err(why) = &dispatch {
             tracing::warn!(job_id = %id, why, "a job is left to the release that wrote its record");
@@ -58,11 +58,6 @@ impl JobStoreState {
             self.lock().jobs.remove(&id);
         }
         Ok(reservation)
-    }
-
-    /// Adds the job of an open record to the open jobs, with pins of its inputs.
-    pub(super) fn track(&self, record: &JobRecord) {
-        self.open(record.id.clone(), record.request().map(|_| Dispatch::of(record)), self.pins(record));
     }
 
     /// Writes the latest record of a job, and makes its end visible. Writers of one job take turns, so the last write
@@ -217,7 +212,8 @@ impl JobStore {
                     error = Some(failed);
                 }
             } else {
-                inner.track(&record);
+                let dispatch = record.request().map(|_| Dispatch::of(&record));
+                inner.open(record.id.clone(), dispatch, inner.pins(&record));
             }
         }
         if is_any_read {

@@ -118,7 +118,8 @@ impl Runner {
 
     async fn run_attempts(mut self, attempts: u32) -> RunEnd {
         let (jobs, job, stop) = (self.jobs.clone(), Arc::clone(&self.owned.job), Arc::clone(&self.owned.stop));
-        let (mut pause, mut counted) = (Duration::ZERO, attempts - u32::from(self.ticket.is_some()));
+        let (mut pause, mut store_pause) = (Duration::ZERO, Duration::ZERO);
+        let mut counted = attempts - u32::from(self.ticket.is_some());
         loop {
             let attempt = async {
                 if !pause.is_zero() {
@@ -132,7 +133,7 @@ impl Runner {
                 attempt = attempt => attempt,
                 () = stop.notified() => {
                     let is_decided = job.is_decided();
-                    return if is_decided { RunEnd::done(true) } else { RunEnd::unused(ClaimEnd::Abandon) };
+                    return if is_decided { RunEnd::done(true) } else { RunEnd::without_record(ClaimEnd::Abandon) };
                 }
                 () = jobs.0.runs.reached(Phase::Return) => Err(NoResult::Stopped),
             };
@@ -154,7 +155,8 @@ impl Runner {
                 Err(NoResult::StoreFailed { error, message }) => {
                     tracing::warn!(job_id = %job.id(), %error, "{message}");
                     counted = job.record().attempts;
-                    pause = (pause * 2).clamp(retry::FIRST_PAUSE, retry::MAX_PAUSE);
+                    store_pause = (store_pause * 2).clamp(retry::FIRST_PAUSE, retry::MAX_PAUSE);
+                    pause = store_pause;
                     continue;
                 }
                 Err(NoResult::Locked) => return RunEnd::returned(LOCKED_DELAY, true),
@@ -162,7 +164,7 @@ impl Runner {
             };
             if ending.is_err() && jobs.is_superseded(&job).await {
                 tracing::warn!(job_id = %job.id(), "another worker runs a later attempt of a job that failed");
-                return RunEnd::unused(ClaimEnd::Abandon);
+                return RunEnd::without_record(ClaimEnd::Abandon);
             }
             return RunEnd::done(jobs.finish(&job, ending).await);
         }
@@ -242,8 +244,8 @@ async fn save(
     finished: Arc<Finished>,
 ) -> Result<(String, Pin), EndError> {
     let report = &finished.product.report;
-    let (resolution, digest) = (report.resolution, finished.digest);
-    let key = ContentKey::new(&digest, options, format, &report.file_arithmetic(), record.namespace);
+    let resolution = report.resolution;
+    let key = ContentKey::new(&record.input, options, format, &report.file_arithmetic(), record.namespace);
     let parent = record.requester.parent(&jobs.0.pool.settings().tracer);
     let span = TraceSpan::start(&parent, "save", SpanKind::Internal, Instant::now());
     let failed = |error| EndError::Save { error, resolution };
@@ -297,7 +299,7 @@ impl JobStore {
     /// if another worker has claimed the job already.
     async fn return_to_queue(&self, job: &DurableJob, attempts: u32, lacked_memory: bool) -> RunEnd {
         if self.is_superseded(job).await {
-            return RunEnd::unused(ClaimEnd::Abandon);
+            return RunEnd::without_record(ClaimEnd::Abandon);
         }
         let delay = if lacked_memory { memory_pause(job.record().memory_waits) } else { Duration::ZERO };
         let is_changed = job.return_to_queue(attempts, lacked_memory);

@@ -31,18 +31,18 @@ pub(super) struct RunEnd {
 }
 
 impl RunEnd {
-    /// The job has ended.
+    /// Returns the end of a run whose job has ended.
     pub(super) const fn done(recorded: bool) -> Self {
         Self { claim: ClaimEnd::Done, recorded: Some(recorded) }
     }
 
-    /// The job returns to the queue, and can be claimed again after `delay`.
+    /// Returns the end of a run whose job returns to the queue and can be claimed again after `delay`.
     pub(super) const fn returned(delay: Duration, recorded: bool) -> Self {
         Self { claim: ClaimEnd::Release(delay), recorded: Some(recorded) }
     }
 
-    /// The run was not necessary, or another one takes over.
-    pub(super) const fn unused(claim: ClaimEnd) -> Self {
+    /// Returns the end of a run that wrote no record: it was not necessary, or another one takes over.
+    pub(super) const fn without_record(claim: ClaimEnd) -> Self {
         Self { claim, recorded: None }
     }
 }

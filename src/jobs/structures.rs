@@ -9,14 +9,13 @@ use std::time::Duration;
 use metrics::{counter, gauge};
 
 use super::kept::{
-    CacheKey, CacheState, Charged, Input, Kept, Shared, SharedColors, SharedStructure, SharedTileset, streamed_digest,
-    tileset_digest,
+    CacheKey, CacheState, Charged, Input, Kept, Shared, SharedColors, SharedStructure, SharedTileset, tileset_digests,
 };
 use super::{MemoryReservation, ScratchSpace};
 use crate::memory_budget::{Budget, Reclaim};
 use crate::pipeline::tileset::{self, StreamSource, StructureStream, Tileset};
 use crate::pipeline::{JobError, Options, StageClock};
-use crate::store::{Digest, Namespace};
+use crate::store::Digest;
 use crate::structure::stream::BLOCK_BYTES;
 use crate::structure::{self, ReadLimits, StructureError};
 use crate::surface::{CancelToken, Control, Exceeded, Limit, MemoryMeter as _, OutOfMemory, Reservation, SurfaceError};
@@ -61,14 +60,14 @@ impl Structures {
         structures
     }
 
-    /// Finds a file in the cache. For a `job` on a tile, its tileset comes first: returns the tileset itself if its
+    /// Finds a file in the cache. If `options` have a tile, its tileset comes first: returns the tileset itself if its
     /// atoms are on disk, else its structure.
-    pub(crate) fn find(&self, namespace: Namespace, digest: Digest, options: Option<&Options>) -> Option<Input> {
+    pub(crate) fn find(&self, key: CacheKey, options: Option<&Options>) -> Option<Input> {
         let options = options.filter(|options| options.tile.is_some());
-        let tilesets = options.map(|options| [tileset_digest(&digest, options), streamed_digest(&digest, options)]);
+        let tilesets = options.map(|options| tileset_keys(key, options));
         let mut state = self.lock();
-        let mut digests = tilesets.into_iter().flatten().chain([digest]);
-        let kept = digests.find_map(|digest| state.find(&(namespace, digest)))?;
+        let mut keys = tilesets.into_iter().flatten().chain([key]);
+        let kept = keys.find_map(|key| state.find(&key))?;
         let Some(tileset): Option<SharedTileset> = kept.get() else { return kept.get().map(Input::Kept) };
         Some(if tileset.is_streamed() { Input::Tileset(tileset) } else { Input::Kept(tileset.structure().clone()) })
     }
@@ -82,8 +81,7 @@ impl Structures {
     /// Returns the errors of [`structure::read_with`].
     pub(crate) fn get(
         &self,
-        namespace: Namespace,
-        digest: Digest,
+        key: CacheKey,
         input: &Input,
         limits: &ReadLimits,
         control: &Control<'_>,
@@ -100,7 +98,6 @@ impl Structures {
             Input::Tileset(_) => return Err(StructureError::Scratch { reason: "the atoms are on disk".to_owned() }),
         };
         control.memory.also_held(file.len() as u64);
-        let key = (namespace, digest);
         let found = self.find_or_begin(&[key], &control.cancel).ok_or(StructureError::Cancelled)?;
         if let Some(kept) = found.as_ref().ok().and_then(Kept::get) {
             return hit(kept);
@@ -129,17 +126,16 @@ impl Structures {
     /// [`SurfaceError::Limit`] if one of them does not fit into the cache.
     pub(crate) fn tileset(
         &self,
-        (namespace, digest): CacheKey,
+        key: CacheKey,
         input: &Input,
         options: &Options,
         limits: &ReadLimits,
         control: &Control<'_>,
         clock: &StageClock<'_>,
     ) -> Result<(SharedTileset, Option<SharedColors>), JobError> {
-        let [memory_digest, disk_digest] = [tileset_digest(&digest, options), streamed_digest(&digest, options)];
-        let keys = [memory_digest, disk_digest].map(|digest| (namespace, digest));
+        let keys = tileset_keys(key, options);
         let in_memory = |limits: &ReadLimits| {
-            let read = |control: &Control<'_>| self.get(namespace, digest, input, limits, control);
+            let read = |control: &Control<'_>| self.get(key, input, limits, control);
             let prepare = |control: &Control<'_>| Tileset::new(read, options, limits, control, clock);
             self.made(keys[0], input, control, &self.budget.part(self.limit), prepare)
         };
@@ -176,9 +172,9 @@ impl Structures {
             Input::Tileset(tileset) => tileset.clone(),
             _ => self.found_or_made(&keys, control, make)?,
         };
-        let prepared_digest = if tileset.is_streamed() { disk_digest } else { memory_digest };
+        let (namespace, prepared) = keys[usize::from(tileset.is_streamed())];
         let Some(coloring) = options.color else { return Ok((tileset, None)) };
-        let key = (namespace, Digest::of(format!("colors\n{prepared_digest}\n{}", coloring.canonical()).as_bytes()));
+        let key = (namespace, Digest::of(format!("colors\n{prepared}\n{}", coloring.canonical()).as_bytes()));
         let prepare = |control: &Control<'_>| tileset.colors(coloring, control);
         let budget = self.budget.part(self.limit);
         let make = || self.made(key, input, control, &budget, prepare);
@@ -265,9 +261,9 @@ impl Structures {
         Ok(shared)
     }
 
-    /// Finds a value with one of the keys, or returns the mark of the first key, which the caller keeps while it makes
-    /// the value.
-    /// Waits while another request makes it; `None` if this one is cancelled. There is at least one key.
+    /// Finds a value with one of the keys. If there is none, returns the mark of the first key as an error; the caller
+    /// holds it while it makes the value. Waits while another request makes it; `None` if this one is cancelled. There
+    /// is at least one key.
     fn find_or_begin(&self, keys: &[CacheKey], cancel: &CancelToken) -> Option<Result<Kept, MakingMark<'_>>> {
         let key = *keys.first()?;
         let mut state = self.lock();
@@ -353,6 +349,11 @@ impl Drop for MakingMark<'_> {
     }
 }
 
+/// Returns the keys of a tileset: in memory, and with its atoms on disk.
+fn tileset_keys((namespace, digest): CacheKey, options: &Options) -> [CacheKey; 2] {
+    tileset_digests(&digest, options).map(|digest| (namespace, digest))
+}
+
 #[expect(clippy::cast_precision_loss, reason = "gauges are floats; exact up to 8 PiB")]
 fn publish(state: &CacheState) {
     gauge!(STRUCTURE_CACHE_BYTES).set(state.bytes as f64);
@@ -366,6 +367,7 @@ mod tests {
 
     use super::*;
     use crate::pipeline::params;
+    use crate::store::Namespace;
     use crate::surface::CancelToken;
 
     type File = (Input, Digest);
@@ -381,7 +383,7 @@ mod tests {
     type Got = Result<SharedStructure, StructureError>;
 
     fn get_with(structures: &Structures, (input, digest): &File, control: &Control<'_>) -> Got {
-        structures.get(Namespace::default(), *digest, input, &ReadLimits::default(), control)
+        structures.get((Namespace::default(), *digest), input, &ReadLimits::default(), control)
     }
 
     fn get(structures: &Structures, file: &File) -> SharedStructure {
@@ -407,11 +409,11 @@ mod tests {
         let first = get(&structures, &file);
         assert!(Arc::ptr_eq(&first.0, &get(&structures, &file).0));
         let other = Namespace::from_group(&[1; 32], "other");
-        let elsewhere = structures.get(other, file.1, &file.0, &ReadLimits::default(), &Control::default()).unwrap();
+        let elsewhere = structures.get((other, file.1), &file.0, &ReadLimits::default(), &Control::default()).unwrap();
         assert!(!Arc::ptr_eq(&first.0, &elsewhere.0));
         assert_eq!(*first, *elsewhere);
         let tight = ReadLimits { max_atoms: 9, ..ReadLimits::default() };
-        let refused = structures.get(Namespace::default(), file.1, &file.0, &tight, &Control::default());
+        let refused = structures.get((Namespace::default(), file.1), &file.0, &tight, &Control::default());
         assert_eq!(refused.unwrap_err(), Exceeded::new(Limit::Atoms, 9).error());
     }
 
@@ -498,7 +500,7 @@ mod tests {
         assert!(got.iter().all(|tileset| Arc::ptr_eq(&tileset.0, &got[0].0)));
         assert!(!Arc::ptr_eq(&got[0].0, &get(&other).0), "the control");
         // A structure that was evicted is found in its tileset, for jobs on its tiles only.
-        let found = |options| match structures.find(Namespace::default(), digest, options) {
+        let found = |options| match structures.find((Namespace::default(), digest), options) {
             Some(Input::Kept(found)) => Some(Arc::as_ptr(&found.0)),
             _ => None,
         };

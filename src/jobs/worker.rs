@@ -46,7 +46,7 @@ fn run(shared: &WorkerContext, entry: QueuedTask) -> Result<Option<Outcome>, Res
     let id = task.id.clone();
     if cancel.is_cancelled() {
         // It may have had to give its worker away before the threads of the worker were ready.
-        if shared.queue.restart(entry_id, task, on_start).is_none() {
+        if shared.queue.restart(entry_id, task, on_start).is_ok() {
             return Err(Restarted);
         }
         counter!(JOBS_FINISHED, "outcome" => "dismissed").increment(1);
@@ -108,11 +108,11 @@ fn run(shared: &WorkerContext, entry: QueuedTask) -> Result<Option<Outcome>, Res
         }
         drop(drawing);
         reservation.set(bytes_of(&product));
-        Ok(Finished { product, diagnostics, digest: task.digest, reservation })
+        Ok(Finished { product, diagnostics, reservation })
     });
     let was_cancelled = outcome.as_ref().err().is_some_and(Failure::is_cancelled);
-    let task = if was_cancelled { shared.queue.restart(entry_id, task, Vec::new()) } else { Some(task) };
-    let Some(task) = task else { return Err(Restarted) };
+    let restarted = if was_cancelled { shared.queue.restart(entry_id, task, Vec::new()) } else { Err(task) };
+    let Err(task) = restarted else { return Err(Restarted) };
     // Frees the input before the outcome is sent, so that the receiver sees the true memory use.
     drop(task);
     let outcome = outcome.map(Arc::new);
@@ -144,7 +144,7 @@ fn product(
             &WorkScope::new(&clock, control),
         );
     }
-    let read = |control: &Control<'_>| structures.get(*namespace, *digest, input, &limits.read, control);
+    let read = |control: &Control<'_>| structures.get((*namespace, *digest), input, &limits.read, control);
     pipeline::run_with(read, options, limits, choice, control, progress, None)
 }
 

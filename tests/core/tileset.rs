@@ -209,7 +209,7 @@ fn an_assembly_repeats_the_tilesets_of_its_units() {
     assert_eq!(root.instances.unwrap().atoms_sum, whole.report.instances.unwrap().atoms_sum);
     assert_eq!(root.parts.iter().map(|part| part.atoms).collect::<Vec<_>>(), [454, 908]);
     assert!(root.closed && root.resolution == repeated.iter().map(|unit| unit.bounds.error).fold(0.0, f64::max));
-    // Its job reports the times of all stages, from reading on.
+    // A job on the root tile reports the times of all stages, including reading.
     let options = params::parse(pairs.into_iter().chain([("tile", "0/0/0/0")])).unwrap().options;
     let job = run(text.as_bytes(), &options, &limits, &choice, &control, &(), None).unwrap().report;
     assert_eq!((job.atoms, job.resolution), (root_atoms, root_resolution));

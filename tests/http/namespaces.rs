@@ -98,6 +98,7 @@ fn objects_of_another_group_do_not_exist_for_a_key() {
     let routes = [
         ("GET", structure.clone()),
         ("GET", format!("{structure}/atoms")),
+        ("GET", format!("{structure}/areas?surface=sas")),
         ("GET", format!("{structure}/colors?scheme=chain")),
         ("GET", format!("{structure}/surface.glb")),
         ("GET", format!("{structure}/surface.png?width=100&height=100")),

@@ -102,7 +102,7 @@ fn uploads(seen: &Seen, server: &Running) {
     }
 }
 
-/// Meshes, reports, atoms and colours of entries and stored structures.
+/// Meshes, reports and documents of entries and stored structures.
 fn surfaces(seen: &Seen, server: &Running) {
     let structure = location(&seen.ask(server.addr, "POST", "/v1/structures", &[], SAMPLE));
     for base in [structure.as_str(), "/v1/pdb/4pti"] {
@@ -144,27 +144,30 @@ fn surfaces(seen: &Seen, server: &Running) {
         }
         get(&format!("{base}/surface.ply"), &other[..1], 412);
         get(&format!("{base}/report.json"), &[("if-match", "\"other\"")], 200);
-        let colors = format!("{base}/colors?scheme=chain");
-        let tag = get(&colors, &[], 200).header("etag").unwrap().to_owned();
-        get(&colors, &[("if-none-match", &tag)], 304);
-        get(&colors, &[("if-match", "\"other\"")], 412);
+        for document in DOCUMENTS {
+            let path = format!("{base}/{document}");
+            let whole = get(&path, &[], 200);
+            get(&path, &[("if-none-match", whole.header("etag").unwrap())], 304);
+            get(&path, &[("if-match", "\"other\"")], 412);
+            get(&format!("{path}{}x=1", if path.contains('?') { '&' } else { '?' }), &[], 400);
+        }
+        let [colors, areas] = [1, 2].map(|i| format!("{base}/{}", DOCUMENTS[i]));
         get(&colors, &[("range", "bytes=0-9")], 206);
         get(&colors, &[("range", "bytes=99999999-")], 416);
+        assert_eq!(get(&areas, &[], 200).header("content-type"), Some("text/csv"));
+        // Required parameters.
         get(&format!("{base}/colors"), &[], 400);
-        get(&format!("{colors}&chains=Z"), &[], 422);
-        let areas = format!("{base}/areas?surface=sas");
-        let table = get(&areas, &[], 200);
-        assert_eq!(table.header("content-type"), Some("text/csv"));
-        get(&areas, &[("if-none-match", table.header("etag").unwrap())], 304);
-        get(&areas, &[("if-match", "\"other\"")], 412);
         get(&format!("{base}/areas"), &[], 400);
-        get(&format!("{areas}&interface=A,Z"), &[], 422);
-        get(&format!("{areas}&chains=Z"), &[], 422);
-        let atoms = format!("{base}/atoms");
-        let tag = get(&atoms, &[], 200).header("etag").unwrap().to_owned();
-        get(&atoms, &[("if-none-match", &tag)], 304);
-        get(&format!("{atoms}?x=1"), &[], 400);
-        get(&format!("{atoms}?positions=true&chains=Z"), &[], 422);
+        for query in [
+            "colors?scheme=chain&chains=Z",
+            "areas?surface=sas&interface=A,Z",
+            "areas?surface=sas&chains=Z",
+            "atoms?positions=true&chains=Z",
+            "tileset.json?chains=Z",
+            "tileset.subtree?chains=Z",
+        ] {
+            get(&format!("{base}/{query}"), &[], 422);
+        }
         let report = kept.replace(".glb", "/report.json");
         let tag = get(&report, &[], 200).header("etag").unwrap().to_owned();
         get(&report, &[("if-none-match", &tag)], 304);
@@ -183,24 +186,6 @@ fn surfaces(seen: &Seen, server: &Running) {
     get(&format!("/v1/structures/{ZERO}/report.json"), &[], 404);
     get(&format!("/v1/results/{ZERO}.glb"), &[], 404);
     get(&format!("/v1/results/{ZERO}/report.json"), &[], 404);
-}
-
-/// Tilesets of entries and stored structures.
-fn tilesets(seen: &Seen, server: &Running) {
-    let structure = location(&seen.ask(server.addr, "POST", "/v1/structures", &[], SAMPLE));
-    let files = ["tileset.json", "tileset.subtree"];
-    for tileset in
-        [structure.as_str(), "/v1/pdb/4pti"].iter().flat_map(|base| files.map(|file| format!("{base}/{file}")))
-    {
-        let get = |path: &str, headers: &[(&str, &str)], status: u16| {
-            seen.expect(status, server.addr, ("GET", path), headers, b"")
-        };
-        let tag = get(&tileset, &[], 200).header("etag").unwrap().to_owned();
-        get(&tileset, &[("if-none-match", &tag)], 304);
-        get(&tileset, &[("if-match", "\"other\"")], 412);
-        get(&format!("{tileset}?x=1"), &[], 400);
-        get(&format!("{tileset}?chains=Z"), &[], 422);
-    }
 }
 
 /// Jobs that succeed, fail, are cancelled or exceed their deadline.
@@ -424,7 +409,6 @@ fn the_server_returns_every_documented_status_and_no_other() {
     plain(&seen, &server);
     uploads(&seen, &server);
     surfaces(&seen, &server);
-    tilesets(&seen, &server);
     jobs(&seen);
     sizes(&seen);
     failures(&seen);

@@ -33,7 +33,7 @@ pub enum Format {
 
 /// Error: no format has this name.
 #[derive(Debug, Clone, PartialEq, Eq, Error)]
-#[error("unknown format `{0}`; expected one of glb, gltf, ply, ply-text, stl, obj, vtp, vert, face, png")]
+#[error("unknown format `{0}`; expected one of {names}", names = Format::NAMES.join(", "))]
 pub struct UnknownFormat(pub String);
 
 named!(Format, Glb => "glb", Gltf => "gltf", Ply => "ply", PlyText => "ply-text", Stl => "stl", Obj => "obj",

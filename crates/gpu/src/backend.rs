@@ -118,9 +118,9 @@ impl Backend for GpuBackend {
         let BackendJob { spheres, params, limits, control, sink } = *job;
         control.check()?;
         let (metered, memory) = control.with_reservation();
-        let job = Self::job(spheres, params, limits, &metered)?;
-        let completed = self.pool.run(&job).and_then(|mut completed| {
-            control.span(Stage::Measure, || completed.finished.measure(&job.prepared))?;
+        let gpu_job = Self::job(spheres, params, limits, &metered)?;
+        let completed = self.pool.run(&gpu_job).and_then(|mut completed| {
+            control.span(Stage::Measure, || completed.finished.measure(&gpu_job.prepared))?;
             Ok(completed)
         });
         let error = match completed {

@@ -15,7 +15,7 @@ use serde::Serialize;
 pub use self::table::AreaLevel;
 use self::table::Row;
 use super::load::{LoadedStructure, SPHERE_BYTES, load};
-use super::{JobError, LeftOutReport, Options, StageClock, WorkScope};
+use super::{JobError, LeftOut, Options, StageClock, WorkScope};
 
 /// Description of the values of `interface`.
 pub const EXPECTED: &str = "the chains of both sides, separated by a comma, such as A,B; several chains of a side are joined by a slash: H/L,A";
@@ -148,7 +148,7 @@ fn round(value: f64) -> f64 {
 #[derive(Debug, Clone)]
 pub struct MeasuredSelection {
     /// Atoms that were not measured.
-    pub left_out: LeftOutReport,
+    pub left_out: LeftOut,
     /// Measures of the selection, or with an interface, those of its sides.
     pub measures: SelectionMeasures,
     /// Areas of the atoms; with an interface, of those of both sides.

@@ -50,7 +50,7 @@ pub use file::{File, Product};
 pub use instances::{AssemblyReport, InstancesReport};
 pub use limits::JobLimits;
 pub use map_file::MapFile;
-pub use molmesh_structure::{KindCount, LeftOut as LeftOutReport, ResidueCount};
+pub use molmesh_structure::{KindCount, LeftOut, ResidueCount};
 pub use parts::PartReport;
 pub use pockets::PocketReport;
 pub use progress::Tracker;
@@ -138,7 +138,7 @@ impl Options {
         self.params.atom_ids || self.color.is_some_and(|color| !matches!(color.scheme, Scheme::Vertex(_)))
     }
 
-    /// Returns true if nothing needs the whole mesh in memory. Without `..`, so that a new field must be considered.
+    /// Returns true if nothing needs the whole mesh in memory. Every field is named, so that a new one is considered.
     fn can_stream(&self) -> bool {
         matches!(
             self,

@@ -123,7 +123,8 @@ fn request(ParsedValues { mut options, strict, .. }: ParsedValues, format: Forma
     Ok(Request { options, format, strict })
 }
 
-/// Parses parameters of a tileset, whose tiles are GLB files, compressed by default. Adds this default to the pairs.
+/// Parses parameters of a tileset, whose tiles are GLB files, compressed by default. If `compress` is absent, adds it
+/// to `pairs`, so that they describe the tiles completely.
 ///
 /// # Errors
 /// Returns the errors of [`parse`], and [`ParamError::BadValue`] for a parameter that does not apply to tiles.

@@ -14,7 +14,7 @@ use super::instances::{AssemblyReport, InstancesReport};
 use super::parts::PartReport;
 use super::pockets::PocketReport;
 use super::shapes::TriangleReport;
-use super::{Choice, LeftOutReport, Options, SimplificationReport, StageClock};
+use super::{Choice, LeftOut, Options, SimplificationReport, StageClock};
 
 /// Quantization of the vertices in the file.
 #[derive(Debug, Clone, Copy, Serialize, utoipa::ToSchema)]
@@ -89,7 +89,7 @@ pub struct Report {
     #[serde(skip_serializing_if = "Option::is_none")]
     pub instances: Option<InstancesReport>,
     /// Atoms of the selected models that are not meshed.
-    pub left_out: LeftOutReport,
+    pub left_out: LeftOut,
     /// Unreadable values that do not affect the mesh, at most 12; absent if there are none.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     #[schema(required = false)]

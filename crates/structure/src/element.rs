@@ -90,7 +90,7 @@ pub(super) fn pdbqt_type(name: &[u8]) -> u8 {
     }
 }
 
-/// Names of beads in residues.
+/// Names of Martini beads, which identify a coarse-grained residue.
 const BEADS: &[&str] = &[
     "BB", "BB1", "BB2", "BB3", "BAS", "SC1", "SC2", "SC3", "SC4", "SC5", "SC6", "NC3", "GL0", "GL1", "GL2", "GL3",
     "GL4", "AM1", "AM2", "ROH", "W",

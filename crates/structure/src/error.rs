@@ -52,7 +52,7 @@ pub enum StructureError {
     /// The disk of the temporary file is full.
     #[error("the disk of the temporary file is full")]
     DiskFull,
-    /// Temporary files use up their limit.
+    /// Other temporary files use the disk space; a later attempt may succeed.
     #[error("{}", disk_space(.0))]
     DiskSpace(OutOfMemory),
     /// The file cannot be read as a stream.
@@ -123,7 +123,7 @@ pub enum StructureError {
     },
 }
 
-/// Describes that temporary files use up their limit.
+/// Describes which temporary files use the disk space.
 fn disk_space(error: &OutOfMemory) -> String {
     let OutOfMemory::Budget { held, limit, .. } = error else { return error.to_string() };
     format!("temporary files take {held} of {limit} bytes of disk space, and indexes of other tilesets are in use")

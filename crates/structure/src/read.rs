@@ -100,7 +100,7 @@ impl<'a> Reading<'a> {
         check(self.control)
     }
 
-    /// Fails as [`Self::check`] does, for every `step`-th `n` only.
+    /// Calls [`Self::check`] if `n` is a multiple of `step`.
     #[inline]
     pub(super) fn check_every(&self, n: usize, step: usize) -> Result<(), StructureError> {
         check_every(self.control, n, step)
@@ -127,7 +127,7 @@ pub(super) fn check(control: &Control<'_>) -> Result<(), StructureError> {
     if control.cancel.is_cancelled() { Err(StructureError::Cancelled) } else { Ok(()) }
 }
 
-/// Fails as [`check`] does, for every `step`-th `n` only.
+/// Calls [`check`] if `n` is a multiple of `step`.
 #[inline]
 pub(super) fn check_every(control: &Control<'_>, n: usize, step: usize) -> Result<(), StructureError> {
     if n.is_multiple_of(step) { check(control) } else { Ok(()) }

@@ -113,7 +113,7 @@ impl Control<'_> {
         if self.cancel.is_cancelled() { Err(SurfaceError::Cancelled) } else { Ok(()) }
     }
 
-    /// Fails as [`Self::check`] does, for every `step`-th `n` only.
+    /// Calls [`Self::check`] if `n` is a multiple of `step`.
     ///
     /// # Errors
     /// [`SurfaceError::Cancelled`].
@@ -144,7 +144,8 @@ impl Control<'_> {
         self.with_reservation().0
     }
 
-    /// Returns a control as [`Self::metered`] does, with its reservation, which may keep the memory.
+    /// Returns the control of [`Self::metered`] and its reservation. After [`Reservation::keep`], the meter of `self`
+    /// still counts the memory.
     #[must_use]
     pub fn with_reservation(&self) -> (Self, Arc<Reservation>) {
         let memory = Arc::new(Reservation::new(&self.memory));

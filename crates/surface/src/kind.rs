@@ -79,15 +79,16 @@ pub enum Preset {
     Quicksurf,
 }
 
-/// Implements names and [`Display`](std::fmt::Display) for an enum of named values. A value after the semicolon is not
-/// a value of the parameter.
+/// Implements `ALL`, `NAMES`, `name`, `named` and [`Display`](std::fmt::Display) for an enum of named values:
+/// `named!(Type, Variant => "name", …)`. A variant after a semicolon has a name but is in neither list: no parameter
+/// accepts it.
 #[macro_export]
 macro_rules! named {
     ($type:ident, $($variant:ident => $name:literal),+ $(; $implied:ident => $implied_name:literal)?) => {
         impl $type {
-            /// Every value, in documentation order.
+            /// Every value that a parameter accepts, in documentation order.
             pub const ALL: [Self; Self::NAMES.len()] = [$(Self::$variant),+];
-            /// Names of all values.
+            /// Names of [`Self::ALL`].
             pub const NAMES: &'static [&'static str] = &[$($name),+];
 
             /// Returns the name of the value in parameters, reports and files.

@@ -11,7 +11,6 @@ pub const MAX_RESOLUTION: f64 = 20.0;
 
 /// Row of the table of limits.
 #[derive(Debug)]
-#[non_exhaustive]
 pub struct LimitRow {
     /// Subject of the error message, unless the error has another one.
     subject: &'static str,
@@ -46,6 +45,7 @@ macro_rules! limits {
         pub enum Limit { $($limit),+ }
 
         /// All limits, in the order of [`Limit`].
+        #[expect(clippy::needless_update, reason = "some rows have all fields")]
         pub const LIMITS: &[LimitRow] = &[$(LimitRow {
             subject: $subject, predicate: $predicate, problem: $problem, $($field: Some($value),)* ..NONE
         }),+];

@@ -35,6 +35,8 @@ pub(super) const WORDS: &[&str] = &[
     "/atoms",
     "/colors",
     "/areas",
+    "/tileset.json",
+    "/tileset.subtree",
     "/estimate",
     "/events",
     "/result",

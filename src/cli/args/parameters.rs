@@ -4,7 +4,7 @@
 use clap::{Arg, ArgAction, ArgMatches, Command, Error, FromArgMatches};
 
 use FlagValue::{Fixed, Given};
-use molmesh::pipeline::params::TABLE;
+use molmesh::pipeline::params::{Domain, TABLE};
 
 /// Value of a flag.
 enum FlagValue {
@@ -28,10 +28,15 @@ impl ParameterFlag {
         let parameter = TABLE.iter().find(|parameter| parameter.name == self.parameter());
         let argument = match (parameter.filter(|_| self.own_help.is_empty()), &self.value) {
             (None, _) => argument.help(self.own_help.trim_start()),
-            (Some(parameter), Fixed(_)) => argument.help(parameter.doc),
+            (Some(parameter), Fixed(_)) => argument.help(with_flags(parameter.doc.trim_end_matches('.'))),
             (Some(parameter), Given(_)) => {
                 let first = parameter.doc.split_once(". ").map_or(parameter.doc, |(first, _)| first);
-                argument.help(first).long_help(parameter.describe())
+                let choices = match parameter.domain {
+                    Domain::Choice(names) => format!(" Values: {}.", names.join(", ")),
+                    _ => String::new(),
+                };
+                let long = with_flags(&parameter.describe()) + &choices;
+                argument.help(with_flags(first.trim_end_matches('.'))).long_help(long)
             }
         };
         match self.value {
@@ -54,6 +59,25 @@ impl ParameterFlag {
         };
         Some((self.parameter(), value))
     }
+}
+
+/// Writes the parameters that a text names as flags: `exact=true` as `--exact`, `max_triangles` as `max-triangles`.
+fn with_flags(text: &str) -> String {
+    let word = |word: &str| {
+        let stem = word.trim_end_matches(['.', ',', ';', ':']);
+        let (name, value) = stem.split_once('=').map_or((stem, None), |(name, value)| (name, Some(value)));
+        if TABLE.iter().all(|parameter| parameter.name != name) {
+            return word.to_owned();
+        }
+        let name = name.replace('_', "-");
+        let flag = match value {
+            None => name,
+            Some("true") => format!("--{name}"),
+            Some(value) => format!("--{name} {value}"),
+        };
+        flag + &word[stem.len()..]
+    };
+    text.split(' ').map(word).collect::<Vec<_>>().join(" ")
 }
 
 /// Declares groups of flags: the heading in the help, and for each flag its name, its value and, if it is not that of

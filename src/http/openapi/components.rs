@@ -115,15 +115,15 @@ struct Components(Map<String, Value>);
 impl Components {
     /// Replaces `value` by a reference to a component. A number distinguishes different values with one name.
     fn replace(&mut self, kind: &str, name: &str, value: &mut Value) {
-        let Value::Object(of_kind) = self.0.entry(kind).or_insert_with(|| json!({})) else { return };
+        let Value::Object(kind_components) = self.0.entry(kind).or_insert_with(|| json!({})) else { return };
         let mut key = name.to_owned();
         let mut number = 1;
-        while of_kind.get(&key).is_some_and(|other| other != value) {
+        while kind_components.get(&key).is_some_and(|other| other != value) {
             number += 1;
             key = format!("{name}-{number}");
         }
         let reference = reference(kind, &key);
-        of_kind.insert(key, std::mem::replace(value, reference));
+        kind_components.insert(key, std::mem::replace(value, reference));
     }
 }
 

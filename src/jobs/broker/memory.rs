@@ -41,7 +41,7 @@ struct BrokerState {
 impl BrokerState {
     fn enqueue(&mut self, id: JobId, place: Place) {
         self.queued.insert(place, id);
-        self.publish();
+        self.publish_queued();
     }
 
     fn take(&mut self, prefers_gpu: bool) -> Option<JobId> {
@@ -49,11 +49,11 @@ impl BrokerState {
         let place = self.order.next(prefers_gpu).into_iter().find_map(|queue| first(queue).map(|(place, _)| *place))?;
         self.order.claimed(place.queue);
         let id = self.queued.remove(&place);
-        self.publish();
+        self.publish_queued();
         id
     }
 
-    fn publish(&self) {
+    fn publish_queued(&self) {
         gauge!(BROKER_QUEUED).set(u32::try_from(self.queued.len()).unwrap_or(u32::MAX));
     }
 }

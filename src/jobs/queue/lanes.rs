@@ -29,14 +29,18 @@ impl Queue {
         }
     }
 
-    /// Queues a job again, in the long lane, if [`Self::make_room`] has cancelled it. Otherwise returns its task.
-    /// `on_start` is the work that its worker has not waited for yet.
-    pub(in crate::jobs) fn restart(&self, id: u64, task: Task, on_start: Vec<OnStart>) -> Option<Task> {
+    /// Queues a job again, in the long lane, if [`Self::make_room`] has cancelled it. `on_start` is the work that its
+    /// worker has not waited for yet.
+    ///
+    /// # Errors
+    /// Returns the task of a job that is not queued again.
+    #[expect(clippy::result_large_err, reason = "gives the task back, once per job")]
+    pub(in crate::jobs) fn restart(&self, id: u64, task: Task, on_start: Vec<OnStart>) -> Result<(), Task> {
         let mut state = self.lock();
-        let Some(at) = state.find(id) else { return Some(task) };
+        let Some(at) = state.find(id) else { return Err(task) };
         let job = &mut state.jobs[at];
         if !std::mem::take(&mut job.is_moving) || job.is_abandoned() {
-            return Some(task);
+            return Err(task);
         }
         job.task = Some(task);
         job.on_start.extend(on_start);
@@ -44,6 +48,6 @@ impl Queue {
         job.progress.restart();
         state.enqueue(at, Lane::Long);
         self.publish(&mut state);
-        None
+        Ok(())
     }
 }

@@ -27,14 +27,14 @@ pub struct Parameter {
 }
 
 impl Parameter {
-    /// Returns the description with the valid values and the default.
+    /// Returns the description with the range or the form of the values, and the default.
     #[must_use]
     pub fn describe(&self) -> String {
         let values = match self.domain {
             Domain::Number { min, max, unit } => format!(" Range: {}.", format!("{min} to {max} {unit}").trim_end()),
             Domain::Integer { min, max } => format!(" Range: {min} to {max}."),
-            Domain::Choice(_) | Domain::Text { .. } => format!(" Value: {}.", self.domain.expected()),
-            Domain::Flag => String::new(),
+            Domain::Text { expected } => format!(" Value: {expected}."),
+            Domain::Choice(_) | Domain::Flag => String::new(),
         };
         let default = Some(self.default).filter(|default| *default != "absent");
         format!("{}{values}{}", self.doc, default.map_or(String::new(), |default| format!(" Default: {default}.")))

@@ -100,7 +100,7 @@ impl<S: Deref<Target = Structure>> AssemblyTileset<S> {
 
     /// Meshes the root: all instances at the coarsest grid spacing of the units, or at the next level at which the grid
     /// does not miss the surface. Atoms are grouped as in coarse tiles. The report includes the times of the clock of
-    /// `scope`.
+    /// `scope`, with those of levels that missed the surface.
     ///
     /// # Errors
     /// Returns the errors of meshing and compression.

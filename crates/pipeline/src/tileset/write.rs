@@ -13,7 +13,7 @@ use serde::Serialize;
 use thiserror::Error;
 
 use super::{AssemblyTileset, StructureStream, Tileset};
-use crate::{Choice, JobError, JobLimits, LeftOutReport, Options, Product, ProgressSink, StageClock, WorkScope};
+use crate::{Choice, JobError, JobLimits, LeftOut, Options, Product, ProgressSink, StageClock, WorkScope};
 
 /// Contents of a tileset.
 #[derive(Debug, Clone, Default, Serialize)]
@@ -23,7 +23,7 @@ pub struct TilesetReport {
     /// Number of meshed atoms.
     pub atoms: u64,
     /// Atoms of the selected models that are not meshed.
-    pub left_out: LeftOutReport,
+    pub left_out: LeftOut,
     /// Levels, coarsest first; empty with `instances`.
     pub levels: Vec<LevelReport>,
     /// Units of the assembly with `instances`; otherwise empty.
@@ -81,7 +81,8 @@ pub enum WriteError {
 
 /// Meshes all tiles of the structure that `read` returns, in parallel, and passes each file with its path to `write`.
 /// With `instances`, writes the tileset of each unit into a folder `unit-NUMBER`. `tileset.json` comes last, so that an
-/// incomplete tileset cannot be opened.
+/// incomplete tileset cannot be opened. Ignores the parameters that
+/// [`params::parse_tileset`](crate::params::parse_tileset) rejects.
 ///
 /// # Errors
 /// Returns a [`WriteError`] if the structure cannot be read, or for the first tile that cannot be meshed or written.
@@ -118,7 +119,7 @@ pub fn write<S: Deref<Target = Structure> + Sync>(
         all.bytes += report.bytes;
     }
     let root = format!("{}.glb", TileAddress::ROOT.path());
-    // The progress is that of the units.
+    // Progress counts the units only, so the root reports none.
     let clock = StageClock::new(&());
     let product = assembly.root(options, limits, choice, &WorkScope::new(&clock, control))?;
     all.bytes += store(&root, &glb_of(&product)?)?;

@@ -260,11 +260,11 @@ impl SelectedBlocks {
         }
         let (mut n_selected, mut left_out, mut residues) = (0, LeftOut::default(), BTreeMap::new());
         for (number, counts) in std::mem::take(&mut self.by_chain).into_values().enumerate() {
-            let of_names: u64 = counts.residues.values().sum();
+            let named_atoms: u64 = counts.residues.values().sum();
             if assembly.is_some_and(|assembly| !assembly.covers(number)) {
                 let LeftOut { other_models, .. } = counts.left_out;
                 left_out.other_models += other_models;
-                left_out.other_chains += counts.n_selected + counts.left_out.sum() - other_models + of_names;
+                left_out.other_chains += counts.n_selected + counts.left_out.sum() - other_models + named_atoms;
                 continue;
             }
             n_selected += counts.n_selected;
@@ -278,6 +278,7 @@ impl SelectedBlocks {
             return Err(StructureError::EmptySelection { holds });
         }
         let counts = residues.iter().map(|((name, kind), n)| (name.as_str(), *kind, *n)).collect();
+        // Adds the unread atoms of the last file.
         self.begin_file();
         left_out.finish(counts, self.unread);
         let (marks, copies, units) = (None, Vec::new(), Vec::new());

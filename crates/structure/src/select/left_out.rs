@@ -59,10 +59,10 @@ pub struct LeftOut {
 }
 
 impl LeftOut {
-    /// Returns the sum of all counts.
+    /// Returns the number of atoms, each counted once.
     pub(super) fn sum(&self) -> u64 {
-        let of_kinds: u64 = self.kinds.iter().map(|kind| kind.atoms).sum();
-        of_kinds
+        let kind_atoms: u64 = self.kinds.iter().map(|kind| kind.atoms).sum();
+        kind_atoms
             + self.other_blocks
             + self.spheres
             + self.other_models
@@ -81,7 +81,7 @@ impl LeftOut {
         self.alternatives += other.alternatives;
     }
 
-    /// Sets the total and the counts of kinds, residue names and atoms of files that were not read.
+    /// Sets the total, the counts by kind and residue name, and the counts of atoms that were not read.
     pub(super) fn finish(&mut self, mut names: Vec<(&str, Kind, u64)>, unread: Unread) {
         (self.other_blocks, self.spheres) = (unread.blocks, unread.spheres);
         names.sort_unstable_by(|(a, i, m), (b, j, n)| n.cmp(m).then(a.cmp(b)).then(i.cmp(j)));

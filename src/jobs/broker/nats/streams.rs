@@ -67,8 +67,8 @@ impl NatsState {
             found => {
                 let info = self.create().await?;
                 if existed {
-                    let consumers = found.map_or(0, |info| info.state.consumer_count);
-                    tracing::warn!(consumers, has_locks, "created streams or consumers of the broker that were lost");
+                    let consumers = found.map(|info| info.state.consumer_count).map_err(|error| error.to_string());
+                    tracing::warn!(?consumers, has_locks, "created streams or consumers of the broker that were lost");
                 }
                 info
             }
