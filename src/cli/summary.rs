@@ -1,5 +1,6 @@
 //! Summary of a report, as text of at most one screen.
 
+use molmesh::formats::Format;
 use molmesh::pipeline::{
     AssemblyReport, CavityReport, ColorReport, ExactReport, InstancesReport, LeftOut, PictureReport, PocketReport,
     Report, SimplificationReport, TriangleReport,
@@ -40,6 +41,10 @@ pub(crate) fn text(report: &Report, files: &[WrittenFile], findings: Option<&[Di
     page.row("mesh", &format!("{} vertices, {} triangles", grouped(report.vertices), grouped(report.triangles)));
     page.rows("vertices", report.quantization.map(|found| format!("quantized in steps of {} Å", found.step)));
     page.rows("colours", report.color.as_ref().map(colors));
+    let colorless = |file: &&WrittenFile| file.format.parse::<Format>().is_ok_and(|format| !format.holds_colors());
+    if let (Some(_), Some(file)) = (&report.color, files.iter().find(colorless)) {
+        page.row("warning", &format!("the format {} has no colours; glb, ply and obj have them", file.format));
+    }
     if let Some(picture) = &report.picture {
         page.row("picture", &drawn(picture));
         page.row("renderer", &format!("{}: {} ({})", picture.renderer, picture.device, picture.reason));
@@ -411,8 +416,8 @@ mod tests {
     #[test]
     fn summary_is_complete_and_fits_one_screen() {
         let name = "a.glb".to_owned();
-        let mesh = WrittenFile { member: "output", name, format: "glb", bytes: 720_000, is_stdout: false };
-        let text = text(&report(), &[mesh], None, Style::PLAIN);
+        let mut mesh = WrittenFile { member: "output", name, format: "glb", bytes: 720_000, is_stdout: false };
+        let text = text(&report(), std::slice::from_ref(&mesh), None, Style::PLAIN);
         for part in [
             "4PTI TRYPSIN INHIBITOR",
             "454 of 514",
@@ -441,5 +446,9 @@ mod tests {
             assert!(text.contains(part), "no `{part}` in\n{text}");
         }
         assert!(text.lines().count() <= 26, "{text}");
+        let warning = "the format stl has no colours";
+        assert!(!text.contains(warning));
+        mesh.format = "stl";
+        assert!(super::text(&report(), &[mesh], None, Style::PLAIN).contains(warning));
     }
 }

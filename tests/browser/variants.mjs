@@ -95,7 +95,8 @@ await run({
       assert.ok(close(three.volume * scale ** 3, Number(headers.get("molmesh-volume")), 2e-3), `${address}: ${three.volume}`);
       const attributes = ["position", ...(variant.normals === "none" ? [] : ["normal"]), ...(variant.atom_ids === "true" ? ["_atom"] : []), ...(variant.color ? ["color"] : [])];
       assert.deepEqual(three.kinds, [attributes.sort().join()], address);
-      assert.deepEqual(three.colors, variant.color ? ["Uint16Array,true,4,true"] : [], address);
+      const stored = variant.compress === "none" ? "Float32Array,false,4,true" : "Uint16Array,true,4,true";
+      assert.deepEqual(three.colors, variant.color ? [stored] : [], address);
       const { parts, color } = json.asset.extras;
       const isDivided = variant.split !== undefined && variant.split !== "none";
       assert.equal(three.parts.length > 1, isDivided, address);

@@ -35,7 +35,7 @@ const SURFACES: [Row; 6] = [
     row("/surface.stl?resolution=1.5&surface=sas", "SAS"),
     row("/surface.stl?resolution=1.5&surface=ses", "SES"),
 ];
-const OTHERS: [Row; 19] = [
+const OTHERS: [Row; 21] = [
     row("/surface.glb?resolution=1.5", "MESHES"),
     row("/surface.glb?resolution=1.5&compress=quantize", "MESHES"),
     row("/surface.glb?resolution=1.5&compress=meshopt", "MESHES"),
@@ -45,6 +45,8 @@ const OTHERS: [Row; 19] = [
     row("/surface.vtp?resolution=1.5", "MESHES"),
     row("/surface.vert?resolution=1.5&surface=ses", "MESHES"),
     row("/surface.face?resolution=1.5&surface=ses", "MESHES"),
+    row("/surface.glb?resolution=1.5&color=element", "MESHES"),
+    row("/surface.glb?resolution=1.5&color=element&compress=quantize", "MESHES"),
     row("/surface.ply?resolution=1.5&color=element&atom_ids=true&split=residue-group", "MESHES"),
     row("/surface.ply?resolution=1&quality=high&cavities=drop", "MESHES"),
     row("/surface.ply?resolution=1&simplify=0.2", "MESHES"),

@@ -93,9 +93,15 @@ pub fn gltf_contents(json: &Value, bin: &[u8]) -> Contents {
         }
     }
     if let Some(accessor) = attributes.get("COLOR_0") {
-        assert_eq!(accessor_of(json, accessor)["normalized"], true);
-        let color = |r: &&[u8]| std::array::from_fn(|k| u16::from_le_bytes([r[2 * k], r[2 * k + 1]]));
-        contents.colors = Some(rows(accessor, 5123, "VEC4", 8).iter().map(color).collect());
+        let float = |r: &&[u8]| std::array::from_fn(|k| (65_535.0 * f32::from_bits(u32_at(r, 4 * k))).round() as u16);
+        let integer = |r: &&[u8]| std::array::from_fn(|k| u16::from_le_bytes([r[2 * k], r[2 * k + 1]]));
+        let quantized = accessor_of(json, accessor)["componentType"] == 5123;
+        assert_eq!(accessor_of(json, accessor)["normalized"].as_bool().unwrap_or(false), quantized);
+        contents.colors = Some(if quantized {
+            rows(accessor, 5123, "VEC4", 8).iter().map(integer).collect()
+        } else {
+            rows(accessor, 5126, "VEC4", 16).iter().map(float).collect()
+        });
     }
     if let Some(accessor) = attributes.get("_ATOM") {
         contents.atoms = Some(match accessor_of(json, accessor)["componentType"].as_u64().unwrap() {

@@ -71,6 +71,12 @@ impl Format {
         matches!(self, Self::Glb | Self::Gltf)
     }
 
+    /// Returns true if the format can hold a colour for each vertex.
+    #[must_use]
+    pub const fn holds_colors(self) -> bool {
+        !matches!(self, Self::Stl | Self::Vert | Self::Face)
+    }
+
     /// Returns true if the format can repeat a mesh.
     #[must_use]
     pub const fn holds_instances(self) -> bool {

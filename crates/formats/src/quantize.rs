@@ -83,4 +83,13 @@ impl Packing {
             Self::Quantized(_) => 4,
         }
     }
+
+    /// Stride of colours, bytes: four floats, because some programs read 16-bit integers as other colours, or four
+    /// 16-bit integers.
+    pub(super) const fn color_bytes(self) -> u64 {
+        match self {
+            Self::Full => 16,
+            Self::Quantized(_) => 8,
+        }
+    }
 }

@@ -12,7 +12,7 @@ use super::Options;
 const STRUCTURES: u32 = 1;
 
 /// Version of what follows a surface and is common to all kinds: simplification, parts, colours, formats.
-const MESHES: u32 = 1;
+const MESHES: u32 = 2;
 
 /// Version of the drawing of a picture.
 const PICTURES: u32 = 1;

@@ -5,7 +5,7 @@ use std::io::{self, Write};
 
 use molmesh_surface::{Mesh, MeshPart, Vertices};
 
-use super::layout::{ATOM_BYTES, AtomType, BufferLayout, COLOR_BYTES, IndexType, ROTATION_BYTES, TRANSLATION_BYTES};
+use super::layout::{ATOM_BYTES, AtomType, BufferLayout, IndexType, ROTATION_BYTES, TRANSLATION_BYTES};
 use crate::block::{convert_words, write_rows};
 use crate::{Packing, Step, quantize};
 
@@ -84,7 +84,7 @@ impl<'a> ColumnRows<'a> {
         let (span, row_bytes) = match self {
             Self::Positions(_) | Self::QuantizedPositions(_) => (layout.positions, packing.position_bytes()),
             Self::Normals(_) | Self::QuantizedNormals(_) => (layout.normals?, packing.normal_bytes()),
-            Self::Colors(_) => (layout.colors?, COLOR_BYTES),
+            Self::Colors(_) => (layout.colors?, packing.color_bytes()),
             Self::Atoms(_) => (layout.atoms?.1, ATOM_BYTES),
             Self::Translations(_) => (layout.placements?[0], TRANSLATION_BYTES),
             Self::Rotations(_) => (layout.placements?[1], ROTATION_BYTES),
@@ -107,13 +107,19 @@ impl<'a> ColumnRows<'a> {
                 let [x, y, z] = quantize::normal(row).map(|v| v.to_le_bytes()[0]);
                 [x, y, z, 0]
             }),
-            (Self::Colors(rows), _) => {
+            (Self::Colors(rows), Packing::Full) => {
+                let linear = linear_of_srgb().map(|level| f32::from(level) / 65_535.0);
+                convert_words(out, rows, |[r, g, b, a]| {
+                    let [r, g, b] = [r, g, b].map(|byte| linear[usize::from(byte)]);
+                    bytemuck::cast::<_, [u8; 16]>([r, g, b, f32::from(a) / 255.0].map(f32::to_le_bytes))
+                })
+            }
+            (Self::Colors(rows), Packing::Quantized(_)) => {
                 let linear = linear_of_srgb();
                 convert_words(out, rows, |[r, g, b, a]| {
                     // 255 · 257 = 65,535
                     let [r, g, b] = [r, g, b].map(|byte| linear[usize::from(byte)]);
-                    let [[r0, r1], [g0, g1], [b0, b1], [a0, a1]] = [r, g, b, 257 * u16::from(a)].map(u16::to_le_bytes);
-                    [r0, r1, g0, g1, b0, b1, a0, a1]
+                    bytemuck::cast::<_, [u8; 8]>([r, g, b, 257 * u16::from(a)].map(u16::to_le_bytes))
                 })
             }
             (Self::Atoms(rows), _) => match layout.atoms {

@@ -14,7 +14,7 @@ use gltf_json::{Accessor, Asset, Buffer, Index, Material, Mesh as GltfMesh, Node
 use serde_json::{Map, Value, json};
 
 use super::layout::{
-    ATOM_BYTES, AtomType, BufferLayout, BufferSpan, COLOR_BYTES, Drawn, IndexType, ROTATION_BYTES, TRANSLATION_BYTES,
+    ATOM_BYTES, AtomType, BufferLayout, BufferSpan, Drawn, IndexType, ROTATION_BYTES, TRANSLATION_BYTES,
 };
 use super::pieces::Pieces;
 use crate::check::Summary;
@@ -236,9 +236,9 @@ impl BufferColumns {
         material: Index<Material>,
     ) -> Self {
         let packing = layout.storage.packing;
-        let [position, normal] = match packing {
-            Packing::Full => [ComponentType::F32, ComponentType::F32],
-            Packing::Quantized(_) => [ComponentType::I16, ComponentType::I8],
+        let [position, normal, color] = match packing {
+            Packing::Full => [ComponentType::F32; 3],
+            Packing::Quantized(_) => [ComponentType::I16, ComponentType::I8, ComponentType::U16],
         };
         let mut attribute = |semantic, span, row_bytes, component, shape| {
             let stride = match component {
@@ -255,9 +255,8 @@ impl BufferColumns {
         // Without normals viewers shade each triangle flat, as the standard requires.
         let bytes = packing.normal_bytes();
         attributes.extend(layout.normals.map(|span| attribute(Semantic::Normals, span, bytes, normal, Type::Vec3)));
-        attributes.extend(
-            layout.colors.map(|span| attribute(Semantic::Colors(0), span, COLOR_BYTES, ComponentType::U16, Type::Vec4)),
-        );
+        let bytes = packing.color_bytes();
+        attributes.extend(layout.colors.map(|span| attribute(Semantic::Colors(0), span, bytes, color, Type::Vec4)));
         attributes.extend(layout.atoms.map(|(atom_type, span)| {
             let component = match atom_type {
                 AtomType::U16 => ComponentType::U16,

@@ -10,8 +10,6 @@ use crate::{FormatError, Storage};
 /// Limit up to which every integer is exact in a 32-bit float.
 const MAX_EXACT_F32: u32 = 1 << 24;
 
-/// Length of a colour: four 16-bit integers.
-pub(super) const COLOR_BYTES: u64 = 8;
 /// Lengths of the translation and the rotation of an instance.
 pub(super) const TRANSLATION_BYTES: u64 = 12;
 pub(super) const ROTATION_BYTES: u64 = 16;
@@ -166,7 +164,7 @@ impl BufferLayout {
         };
         let positions = span(storage.packing.position_bytes() * n_vertices);
         let normals = storage.normal_bytes().map(|bytes| span(bytes * n_vertices));
-        let colors = colors.then(|| span(COLOR_BYTES * n_vertices));
+        let colors = colors.then(|| span(storage.packing.color_bytes() * n_vertices));
         let atoms = atoms.map(|atom_type| (atom_type, span(ATOM_BYTES * n_vertices)));
         let placements =
             (n_placements > 0).then(|| [TRANSLATION_BYTES, ROTATION_BYTES].map(|of| span(of * n_placements)));
@@ -237,10 +235,10 @@ mod tests {
         let quantized = Packing::Quantized(Step::covering(1.0));
         let bare = |packing: Packing| Storage { packing, normals: Normals::None, ..Storage::default() };
         for (storage, vertices) in [
-            (Packing::Full.into(), 60 + 60),
-            (quantized.into(), 40 + 20),
-            (bare(Packing::Full), 60),
-            (bare(quantized), 40),
+            (Packing::Full.into(), 60 + 60 + 80),
+            (quantized.into(), 40 + 20 + 40),
+            (bare(Packing::Full), 60 + 80),
+            (bare(quantized), 40 + 40),
         ] {
             let layout = BufferLayout::new([5, 3, 2], 5, storage, true, Some(AtomType::U16)).unwrap();
             let [translations, rotations] = layout.placements.unwrap();
@@ -250,7 +248,7 @@ mod tests {
                 assert_eq!((span.offset, span.offset % 4), (end, 0));
                 end += span.len;
             }
-            assert_eq!((end, layout.len), (vertices + 40 + 20 + 24 + 32 + 9, vertices + 125));
+            assert_eq!((end, layout.len), (vertices + 20 + 24 + 32 + 9, vertices + 85));
         }
     }
 }
