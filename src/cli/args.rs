@@ -2,10 +2,12 @@
 //! and for HTTP, so that both reject a value with the same message.
 
 mod areas;
+mod batch;
 mod keys;
 mod parameters;
 mod render;
 mod service;
+mod shell;
 mod tileset;
 
 use std::path::PathBuf;
@@ -17,6 +19,7 @@ use molmesh::surface::DeviceChoice;
 
 use super::error::EXIT_CODES;
 pub(crate) use areas::AreasArgs;
+pub(crate) use batch::BatchArgs;
 pub(crate) use keys::{KeyCommand, NewKeyArgs, SignArgs, SigningKeyArgs};
 use parameters::{
     AreaArgs, AreaModelArgs, ChainArgs, CheckArgs, ColorArgs, FileArgs, PartArgs, PictureArgs, SurfaceArgs,
@@ -25,17 +28,19 @@ pub(crate) use render::RenderArgs;
 pub(crate) use service::{
     ConfigCommand, ConfigStyle, DoctorArgs, HealthcheckArgs, LogStyle, PrintArgs, ServeArgs, TextOrJson,
 };
+pub(crate) use shell::{CompletionsArgs, ManArgs};
 pub(crate) use tileset::TilesetArgs;
 
 const MESH_EXAMPLES: &str = "\
 Examples:
   molmesh mesh 4pti.pdb -o 4pti.glb
   molmesh mesh 1gbt.cif.gz -o - --format ply --resolution 0.3 > 1gbt.ply
+  molmesh mesh structures/ -o meshes/ --jobs 4 --skip-existing --summary meshes.jsonl
   curl -sS --fail-with-body http://127.0.0.1:8080/sample.pdb | molmesh mesh - -o 4pti.stl --report json";
 
 /// Watertight molecular-surface meshes from PDB, mmCIF, BinaryCIF, PQR and XYZ files.
 #[derive(Debug, Parser)]
-#[command(name = "molmesh", version, arg_required_else_help = true, disable_help_subcommand = true)]
+#[command(name = "molmesh", version, arg_required_else_help = true)]
 #[command(max_term_width = 100, after_help = EXIT_CODES)]
 pub(crate) struct Args {
     #[command(subcommand)]
@@ -48,13 +53,13 @@ pub(crate) struct Args {
 // A docstring on a struct of flags would replace the description of its command, so those structs have plain comments.
 #[command(defer = true)]
 pub(crate) enum Command {
-    /// Mesh the surface of one structure
+    /// Mesh the surfaces of structures
     Mesh(Box<MeshArgs>),
-    /// Render the surface of one structure as a PNG
+    /// Render the surfaces of structures as PNG
     Render(Box<RenderArgs>),
     /// Mesh one structure into the files of a 3D Tiles tileset, for structures that are too large for one file
     Tileset(Box<TilesetArgs>),
-    /// Write a table of the exact areas of one structure, without a mesh
+    /// Write tables of the exact areas of structures, without a mesh
     Areas(Box<AreasArgs>),
     /// Serve meshes over HTTP
     Serve(Box<ServeArgs>),
@@ -70,6 +75,10 @@ pub(crate) enum Command {
     Key(KeyCommand),
     /// Sign a URL of the service, which then works without a key until it expires
     Sign(SignArgs),
+    /// Print the completions of a shell
+    Completions(CompletionsArgs),
+    /// Print the man page of all commands or of one
+    Man(ManArgs),
     /// Print the version
     Version,
 }
@@ -100,12 +109,15 @@ pub(crate) enum ReportStyle {
 #[derive(Debug, ClapArgs)]
 #[command(after_help = format!("{MESH_EXAMPLES}\n\n{EXIT_CODES}"), allow_negative_numbers = true)]
 pub(crate) struct MeshArgs {
-    /// Structure file: PDB, mmCIF, BinaryCIF, PQR or XYZ, optionally compressed with gzip or zstd; `-` is stdin
-    pub(crate) input: PathBuf,
-    /// Mesh file; `-` is stdout
+    /// Structure files: PDB, mmCIF, BinaryCIF, PQR or XYZ, optionally compressed with gzip or zstd; `-` is stdin. A
+    /// folder stands for the structure files in it and in its subfolders
+    #[arg(required_unless_present = "list", value_name = "INPUT")]
+    pub(crate) inputs: Vec<PathBuf>,
+    /// Mesh file; `-` is stdout. For several inputs: folder, in which each file has the name of its input
     #[arg(short, long)]
     pub(crate) output: PathBuf,
-    /// glb, gltf, ply, ply-text, stl, obj, vtp, vert or face [default: by the extension of the output, glb on stdout]
+    /// glb, gltf, ply, ply-text, stl, obj, vtp, vert or face [default: by the extension of the output, glb on stdout
+    /// and in a folder]
     #[arg(long, value_name = "FORMAT")]
     pub(crate) format: Option<String>,
     #[command(flatten)]
@@ -113,8 +125,22 @@ pub(crate) struct MeshArgs {
     /// Write the atoms of the file to a CSV table, one row per index of `--atom-ids`; `-` is stdout
     #[arg(long, value_name = "FILE")]
     pub(crate) atoms: Option<PathBuf>,
+    /// Also write the exact areas of each input to a CSV table in the folder, as `molmesh areas` does: atom, residue or
+    /// chain [without a value: residue]
+    #[arg(long, value_name = "LEVEL", num_args = 0..=1, require_equals = true, default_missing_value = "residue")]
+    pub(crate) areas: Option<String>,
+    /// Write the areas of all inputs to one CSV table too, with the input in the first column
+    #[arg(long, value_name = "FILE", requires = "areas")]
+    pub(crate) table: Option<PathBuf>,
+    /// Also render each input as a PNG in the folder, as `molmesh render` does
+    #[arg(long)]
+    pub(crate) picture: bool,
+    #[command(flatten)]
+    pub(crate) picture_options: PictureArgs,
     #[command(flatten)]
     pub(crate) job: JobArgs,
+    #[command(flatten)]
+    pub(crate) batch: BatchArgs,
 }
 
 // Flags of every job.
@@ -125,15 +151,8 @@ pub(crate) struct JobArgs {
     pub(crate) backend: BackendName,
     #[command(flatten)]
     pub(crate) devices: DeviceArgs,
-    /// Threads of the computation on the CPU; one per core by default
-    #[arg(long, value_name = "N")]
-    pub(crate) threads: Option<usize>,
-    /// Format of the report
-    #[arg(long, value_enum, default_value = "text")]
-    pub(crate) report: ReportStyle,
-    /// Do not print the summary and the progress bar
-    #[arg(short, long)]
-    pub(crate) quiet: bool,
+    #[command(flatten)]
+    pub(crate) run: RunArgs,
     #[command(flatten)]
     pub(crate) check: CheckArgs,
     #[command(flatten)]
@@ -149,6 +168,20 @@ pub(crate) struct JobArgs {
     pub(crate) parts: PartArgs,
     #[command(flatten)]
     pub(crate) limits: LimitArgs,
+}
+
+// Threads and messages of a command.
+#[derive(Debug, ClapArgs)]
+pub(crate) struct RunArgs {
+    /// Threads of the computation on the CPU; one per core by default
+    #[arg(long, value_name = "N")]
+    pub(crate) threads: Option<usize>,
+    /// Format of the report
+    #[arg(long, value_enum, default_value = "text")]
+    pub(crate) report: ReportStyle,
+    /// Do not print the summary and the progress bar
+    #[arg(short, long)]
+    pub(crate) quiet: bool,
 }
 
 // Devices.

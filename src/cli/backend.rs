@@ -1,7 +1,7 @@
 //! Selection of the backend, with the reason.
 
 use std::num::NonZero;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
 
 use molmesh::config::DevicesConfig;
 #[cfg(feature = "gpu")]
@@ -22,6 +22,8 @@ use super::error::CliError;
 /// Work of a command up to which `--backend auto` takes the CPU, in the units of
 /// [`estimate_work`](molmesh::pipeline::estimate_work): 4 s on two cores. A GPU takes up to a second to start.
 const MAX_CPU_WORK: f64 = 1e6;
+/// Maximum value of `--threads` and `--jobs`: more than any machine has cores.
+const MAX_THREADS: usize = 1024;
 
 /// Requested backend and devices.
 #[derive(Debug)]
@@ -31,17 +33,17 @@ pub(crate) struct BackendRequest<'a> {
     pub(crate) devices: &'a DeviceChoice,
     /// Threads of the CPU backend.
     pub(crate) threads: Option<usize>,
-    /// Estimated work of a command's only job, if there is one and its input is known.
+    /// Estimated work of a command's job, if its input is known.
     pub(crate) work: Option<f64>,
     pub(crate) purpose: Purpose,
 }
 
 /// Purpose of a backend.
-#[derive(Debug)]
+#[derive(Debug, Clone, Copy)]
 pub(crate) enum Purpose {
-    /// One mesh.
+    /// Meshes.
     Mesh,
-    /// One mesh and its picture.
+    /// Meshes and their pictures.
     Picture,
     /// A service, with the size of the readback buffers of each GPU, bytes.
     #[cfg_attr(not(feature = "gpu"), expect(dead_code, reason = "only GPUs have buffers"))]
@@ -49,9 +51,9 @@ pub(crate) enum Purpose {
 }
 
 impl<'a> BackendRequest<'a> {
-    /// Creates the request of a command with a single job of unknown work.
+    /// Creates the request of a command's job of unknown work.
     pub(crate) fn for_command(args: &'a JobArgs, purpose: Purpose) -> Self {
-        let (backend, devices, threads) = (args.backend, &args.devices.devices, args.threads);
+        let (backend, devices, threads) = (args.backend, &args.devices.devices, args.run.threads);
         Self { backend, devices, threads, work: None, purpose }
     }
 
@@ -65,6 +67,12 @@ impl<'a> BackendRequest<'a> {
         matches!(self.purpose, Purpose::Mesh | Purpose::Picture)
     }
 
+    /// Returns true if a GPU may be used.
+    pub(crate) fn may_use_gpu(&self) -> bool {
+        let names_gpu = matches!(self.backend, BackendName::Auto | BackendName::Gpu);
+        names_gpu && *self.devices != DeviceChoice::Cpu && !self.is_too_small()
+    }
+
     /// Returns true if the user leaves the choice of a command's backend to its work, and a GPU would not be faster.
     fn is_too_small(&self) -> bool {
         let is_free = self.backend == BackendName::Auto && *self.devices == DeviceChoice::Auto;
@@ -72,11 +80,46 @@ impl<'a> BackendRequest<'a> {
     }
 }
 
+/// Backend that is selected when a job first needs one. Later jobs share it, so all requests must be equal except for
+/// their work.
+#[derive(Default)]
+pub(crate) struct SharedBackend(Mutex<Option<Arc<SelectedBackend>>>);
+
+impl SharedBackend {
+    /// Returns the backend.
+    ///
+    /// # Errors
+    /// Returns the errors of [`select`].
+    pub(crate) fn get(&self, requested: &BackendRequest<'_>) -> Result<Arc<SelectedBackend>, CliError> {
+        let mut selected = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(selected) = &*selected {
+            return Ok(Arc::clone(selected));
+        }
+        Ok(Arc::clone(selected.insert(Arc::new(select(requested)?))))
+    }
+}
+
+/// Returns the number of threads of a command.
+pub(crate) fn n_threads(threads: Option<usize>) -> usize {
+    threads.unwrap_or_else(|| std::thread::available_parallelism().map_or(1, NonZero::get))
+}
+
+/// Checks a number of threads, the value of the flag `name`.
+///
+/// # Errors
+/// Returns [`CliError::Usage`].
+pub(crate) fn check_threads(name: &str, threads: Option<usize>) -> Result<(), CliError> {
+    let Some(n) = threads.filter(|n| !(1..=MAX_THREADS).contains(n)) else { return Ok(()) };
+    let message = format!("parameter `{name}`: {n} is not allowed; expected a number from 1 to {MAX_THREADS}");
+    Err(CliError::usage(message))
+}
+
 /// Rejects flags that contradict each other.
 ///
 /// # Errors
 /// Returns [`CliError::Usage`] if they do.
 pub(crate) fn check(requested: &BackendRequest<'_>) -> Result<(), CliError> {
+    check_threads("threads", requested.threads)?;
     if requested.backend == BackendName::Gpu && *requested.devices == DeviceChoice::Cpu {
         return Err(CliError::usage("parameter `devices`: cpu is not allowed with --backend gpu; expected a GPU"));
     }
@@ -144,8 +187,7 @@ fn instead_of_gpu(requested: &BackendRequest<'_>, reason: String, none: NoGpu) -
 }
 
 fn cpu(requested: &BackendRequest<'_>) -> Result<Arc<dyn Backend>, CliError> {
-    let all = || std::thread::available_parallelism().map_or(1, NonZero::get);
-    let threads = requested.threads.or_else(|| requested.is_command().then(all));
+    let threads = requested.threads.or_else(|| requested.is_command().then(|| n_threads(None)));
     let backend = CpuBackend::new(threads).map_err(|why| CliError::NoBackend { requested: "cpu", why })?;
     Ok(Arc::new(backend))
 }

@@ -30,6 +30,8 @@ pub(crate) mod code {
     pub(crate) const OUTPUT: i32 = 7;
     /// Another service uses the data folder.
     pub(crate) const IN_USE: i32 = 8;
+    /// Some of several files failed.
+    pub(crate) const BATCH: i32 = 9;
     /// Interrupted (Ctrl-C).
     pub(crate) const INTERRUPTED: i32 = 130;
 }
@@ -46,6 +48,7 @@ Exit codes:
     6  the backend or device does not exist on this machine
     7  the output cannot be written
     8  another service uses the data folder
+    9  some of several files failed; the last line counts them by reason
   130  interrupted; no partial file remains";
 
 /// End of hints about backends.
@@ -88,8 +91,16 @@ pub(crate) enum CliError {
         name: String,
         source: io::Error,
     },
+    /// Some files of a batch failed; the others were written.
+    #[error("{failed} of {files} files failed: {reasons}")]
+    Batch {
+        failed: usize,
+        files: usize,
+        /// Meanings of exit codes, each with the number of files.
+        reasons: String,
+    },
     /// Interrupted by a signal.
-    #[error("interrupted; nothing was written")]
+    #[error("interrupted; no partial file remains")]
     Interrupted,
     /// The service could not start, or is not healthy.
     #[error("{0}")]
@@ -146,11 +157,23 @@ impl CliError {
             Self::NoBackend { .. } | Self::Unfit { backend: true, .. } => code::BACKEND,
             Self::Output { .. } => code::OUTPUT,
             Self::InUse(_) => code::IN_USE,
+            Self::Batch { .. } => code::BATCH,
             Self::Interrupted => code::INTERRUPTED,
             Self::Job { source: JobError::Picture(_), .. }
             | Self::Service(_)
             | Self::Unfit { .. }
             | Self::Internal(_) => code::INTERNAL,
+        }
+    }
+
+    /// Returns true if every other file of a batch would fail as well.
+    pub(crate) fn ends_batch(&self) -> bool {
+        match self {
+            Self::Interrupted | Self::NoBackend { .. } => true,
+            Self::Output { source, .. } => {
+                matches!(source.kind(), io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded)
+            }
+            _ => self.code() == code::INTERRUPTED,
         }
     }
 
@@ -179,6 +202,13 @@ impl CliError {
         // A closed stderr is ignored; the exit code still reports the failure.
         drop(io::stderr().write_all(text.as_bytes()));
     }
+}
+
+/// Returns the meaning of an exit code in a few words.
+pub(crate) fn meaning(code: i32) -> &'static str {
+    let number = code.to_string();
+    let row = EXIT_CODES.lines().filter_map(|line| line.trim().split_once("  ")).find(|(row, _)| *row == number);
+    row.and_then(|(_, text)| text.split([':', ',', ';']).next()).unwrap_or("unknown error")
 }
 
 fn structure_code(error: &StructureError) -> i32 {
@@ -256,7 +286,7 @@ mod tests {
     fn every_error_has_its_exit_code() {
         let job = |source: JobError| CliError::Job { name: "x".into(), source, strict_finding: None };
         let missing = || io::Error::from(io::ErrorKind::NotFound);
-        let cases: [(CliError, i32); 17] = [
+        let cases: [(CliError, i32); 18] = [
             (CliError::Internal(String::new()), 1),
             (CliError::Unfit { failed: vec!["store"], backend: false }, 1),
             (CliError::usage("x"), 2),
@@ -271,6 +301,7 @@ mod tests {
             (FormatError::Limit(Exceeded::new(Limit::FileBytes, 1).into()).into(), 5),
             (CliError::NoBackend { requested: "gpu", why: String::new() }, 6),
             (CliError::InUse(String::new()), 8),
+            (CliError::Batch { failed: 1, files: 2, reasons: String::new() }, 9),
             (CliError::Output { name: "x".into(), source: missing() }, 7),
             (job(SurfaceError::Cancelled.into()), 130),
             (CliError::Interrupted, 130),
@@ -278,6 +309,26 @@ mod tests {
         for (error, expected) in cases {
             assert_eq!(error.code(), expected, "{error}");
         }
+    }
+
+    #[test]
+    fn reasons_of_a_batch_come_from_the_table() {
+        assert_eq!(
+            [3, 4, 5, 77].map(meaning),
+            [
+                "the input cannot be read",
+                "the structure or the map is rejected",
+                "a limit is exceeded",
+                "unknown error",
+            ]
+        );
+    }
+
+    #[test]
+    fn only_errors_of_all_files_end_a_batch() {
+        let output = |kind: io::ErrorKind| CliError::Output { name: "x".into(), source: kind.into() };
+        assert!(output(io::ErrorKind::StorageFull).ends_batch() && CliError::Interrupted.ends_batch());
+        assert!(!output(io::ErrorKind::PermissionDenied).ends_batch() && !CliError::usage("x").ends_batch());
     }
 
     #[test]

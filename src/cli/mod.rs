@@ -6,6 +6,7 @@ mod areas;
 mod args;
 mod backend;
 mod banner;
+mod batch;
 mod config;
 mod doctor;
 mod error;
@@ -22,6 +23,8 @@ mod render;
 mod report;
 mod request;
 mod serve;
+mod setup;
+mod shell;
 mod sign;
 mod style;
 mod summary;
@@ -60,6 +63,8 @@ fn run() -> i32 {
         Command::Healthcheck(args) => healthcheck::run(&args),
         Command::Key(command) => key::run(&command),
         Command::Sign(args) => sign::run(&args),
+        Command::Completions(args) => shell::completions(&args),
+        Command::Man(args) => shell::man(&args),
         Command::Version => version(),
     };
     match result {

@@ -156,20 +156,37 @@ pub(crate) fn refuse_input(input: &Path, output: &Path) -> Result<(), CliError> 
         return Ok(());
     }
     let message = format!("the output `{}` is the input", output.display());
-    Err(CliError::usage_with_hint(message, "name another file with -o"))
+    Err(CliError::usage_with_hint(message, "name another file"))
 }
 
 /// Rejects two outputs with the same path, or both on stdout.
 pub(crate) fn refuse_same(a: &Path, b: &Path) -> Result<(), CliError> {
-    let place = |path: &Path| {
-        let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
-        Some((folder.canonicalize().ok()?, path.file_name()?.to_owned()))
-    };
-    let same = if is_stdio(a) || is_stdio(b) { a == b } else { place(a).is_some_and(|at| place(b) == Some(at)) };
-    if !same {
-        return Ok(());
-    }
-    Err(CliError::usage(format!("two outputs are written to `{}`; expected different files", a.display())))
+    let same = if is_stdio(a) || is_stdio(b) { a == b } else { place(a) == place(b) };
+    if same { Err(same_outputs(a)) } else { Ok(()) }
+}
+
+/// Returns the error of two outputs that are the same file.
+pub(crate) fn same_outputs(path: &Path) -> CliError {
+    CliError::usage(format!("two outputs are written to `{}`; expected different files", path.display()))
+}
+
+/// Returns a path that is equal for all names of an output, also if it or its folder does not exist.
+pub(crate) fn place(path: &Path) -> PathBuf {
+    let path = std::path::absolute(path).unwrap_or_else(|_| path.to_owned());
+    // The part that exists may contain links.
+    let resolved = |at: &Path| Some(at.canonicalize().ok()?.join(path.strip_prefix(at).ok()?));
+    fold_case(path.ancestors().find_map(resolved).unwrap_or(path))
+}
+
+/// Returns the path in lower case on macOS and Windows, where names that differ only in case are the same file.
+pub(crate) fn fold_case(path: PathBuf) -> PathBuf {
+    let has_case = !cfg!(any(target_os = "macos", windows));
+    if has_case { path } else { path.to_string_lossy().to_lowercase().into() }
+}
+
+/// Returns true if the name of an output is that of a folder.
+pub(crate) fn ends_in_slash(path: &Path) -> bool {
+    path.as_os_str().as_encoded_bytes().last().is_some_and(|byte| std::path::is_separator(char::from(*byte)))
 }
 
 /// Returns true if both are the same regular file, also through links or a redirected stdin.

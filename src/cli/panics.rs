@@ -20,7 +20,12 @@ pub(crate) fn contained(command: impl FnOnce() -> Result<(), CliError>) -> Resul
         }));
     }
     strict_validator::quiet_panics();
-    panic::catch_unwind(AssertUnwindSafe(command)).unwrap_or_else(|_| {
+    caught(command)
+}
+
+/// Runs `work`, part of a command in [`contained`], and turns a panic into [`CliError::Internal`].
+pub(crate) fn caught<T>(work: impl FnOnce() -> Result<T, CliError>) -> Result<T, CliError> {
+    panic::catch_unwind(AssertUnwindSafe(work)).unwrap_or_else(|_| {
         let last = LAST.lock().unwrap_or_else(PoisonError::into_inner).take();
         Err(CliError::Internal(last.unwrap_or_else(|| "panic".to_owned())))
     })

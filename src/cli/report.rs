@@ -6,7 +6,7 @@ use molmesh::structure::strict_validator::Diagnostic;
 use serde::Serialize;
 use serde_json::{Value, json};
 
-use super::args::ReportStyle;
+use super::args::{ReportStyle, RunArgs};
 use super::error::CliError;
 use super::page::grouped;
 
@@ -31,27 +31,22 @@ impl WrittenFile {
     }
 }
 
-/// Report of a command.
-pub(super) struct CommandReport<'a, R> {
-    pub(super) report: &'a R,
+/// Report of a command whose files are complete.
+pub(super) struct CommandReport<R> {
+    pub(super) report: R,
     /// Files that the JSON report lists.
-    pub(super) files: &'a [WrittenFile],
+    pub(super) files: Vec<WrittenFile>,
     /// Findings of the strict validator, if it ran.
-    pub(super) findings: Option<&'a [Diagnostic]>,
+    pub(super) findings: Option<Vec<Diagnostic>>,
 }
 
-impl<R: Serialize> CommandReport<'_, R> {
-    /// Writes the report: `text` to stderr unless `is_quiet`, JSON to stdout, or to stderr if a file is on stdout.
-    pub(super) fn write(
-        &self,
-        style: ReportStyle,
-        is_quiet: bool,
-        text: impl FnOnce() -> String,
-    ) -> Result<(), CliError> {
-        match style {
-            ReportStyle::Text if is_quiet => {}
+impl<R: Serialize> CommandReport<R> {
+    /// Writes the report: `text` to stderr unless it is unwanted, JSON to stdout, or to stderr if a file is on stdout.
+    pub(super) fn write(&self, run: &RunArgs, text: impl FnOnce(&Self) -> String) -> Result<(), CliError> {
+        match run.report {
+            ReportStyle::Text if run.quiet => {}
             // The files are finished, so a closed stderr is not an error.
-            ReportStyle::Text => drop(io::stderr().write_all(text().as_bytes())),
+            ReportStyle::Text => drop(io::stderr().write_all(text(self).as_bytes())),
             ReportStyle::Json => {
                 let text = json_text(&self.document()?);
                 if !self.files.iter().any(|file| file.is_stdout) {
@@ -64,13 +59,14 @@ impl<R: Serialize> CommandReport<'_, R> {
         Ok(())
     }
 
-    fn document(&self) -> Result<Value, CliError> {
+    /// Returns the JSON report.
+    pub(super) fn document(&self) -> Result<Value, CliError> {
         let failed = |error| CliError::Internal(format!("the report cannot be serialized: {error}"));
-        let mut document = serde_json::to_value(self.report).map_err(failed)?;
-        for WrittenFile { member, name, format, bytes, .. } in self.files {
+        let mut document = serde_json::to_value(&self.report).map_err(failed)?;
+        for WrittenFile { member, name, format, bytes, .. } in &self.files {
             document[member] = json!({ "file": name, "format": format, "bytes": bytes });
         }
-        if let Some(findings) = self.findings {
+        if let Some(findings) = &self.findings {
             let finding = |f: &Diagnostic| json!({ "level": f.level.name(), "message": f.message, "line": f.line });
             document["findings"] = findings.iter().map(finding).collect();
         }

@@ -14,10 +14,52 @@ use super::backend::{self, BackendRequest};
 use super::error::CliError;
 use super::output::is_stdio;
 
-/// Parses the flags of `mesh`. Without `--format`, the format is that of the file extension of the output.
-pub(super) fn parse_mesh(args: &MeshArgs) -> Result<Request, CliError> {
-    let format = args.format.as_ref().map_or_else(|| format_of(&args.output), |name| mesh_format(name))?;
-    parse(&args.file.0, &args.job, format)
+/// Parameters of `mesh`.
+pub(super) struct ParsedMesh {
+    pub(super) mesh: Request,
+    /// Parameters of `--areas`.
+    pub(super) areas: Option<AreasRequest>,
+    /// Parameters of `--picture`.
+    pub(super) picture: Option<Options>,
+}
+
+/// Parses the flags of `mesh`. Without `--format`, the format is that of the file extension of the output, or GLB in a
+/// folder.
+pub(super) fn parse_mesh(args: &MeshArgs, is_folder: bool) -> Result<ParsedMesh, CliError> {
+    let format = match &args.format {
+        Some(name) => mesh_format(name)?,
+        None if is_folder => Format::default(),
+        None => format_of(&args.output)?,
+    };
+    let mesh = parse(&args.file.0, &args.job, format)?;
+    let areas = args.areas.as_deref().map(|level| areas_of_mesh(&args.job, level)).transpose()?;
+    let picture = if args.picture {
+        // As `molmesh render` parses them.
+        Some(parse(&args.picture_options.0, &args.job, Format::Png)?.options)
+    } else if let Some((name, _)) = args.picture_options.0.first() {
+        return Err(CliError::usage(format!("`--{name}` needs `--picture`")));
+    } else {
+        None
+    };
+    if mesh.options.tile.is_some() && (areas.is_some() || picture.is_some()) {
+        return Err(CliError::usage("`--areas` and `--picture` need a whole structure; leave out `--tile`"));
+    }
+    Ok(ParsedMesh { mesh, areas, picture })
+}
+
+/// Returns the areas of the surface of a mesh, in a table with rows of `level`.
+fn areas_of_mesh(args: &JobArgs, level: &str) -> Result<AreasRequest, CliError> {
+    let mut exact = Vec::new();
+    if !args.surface.0.iter().any(|(name, _)| name == "exact") {
+        exact.push(("exact".to_owned(), "true".to_owned()));
+    }
+    let Request { options, .. } = parse(&exact, args, Format::Glb).map_err(|error| match error {
+        CliError::Usage { message, .. } => CliError::usage_with_hint(message, "`--areas` needs exact areas"),
+        error => error,
+    })?;
+    let surface = options.params.surface.name().to_owned();
+    let by = [("surface".to_owned(), surface), (params::areas::BY.to_owned(), level.to_owned())];
+    Ok(AreasRequest { options, ..params::areas::parse(&by)? })
 }
 
 /// Parses the name of a mesh format.
@@ -99,17 +141,18 @@ fn atom_pairs(atoms: &AtomArgs) -> Vec<(String, String)> {
     atoms.chains.0.iter().cloned().chain(select).collect()
 }
 
-/// Rejects flags of a job that contradict or need each other. `input` is the structure file.
+/// Rejects flags of a job that contradict or need each other. `reads_stdin` is true if a structure file or the list of
+/// inputs is stdin.
 pub(super) fn check(
     args: &JobArgs,
     backend: &BackendRequest<'_>,
     options: &Options,
-    input: &Path,
+    reads_stdin: bool,
 ) -> Result<(), CliError> {
     backend::check(backend)?;
     let map = args.map.as_deref();
-    if map.is_some_and(|map| is_stdio(map) && is_stdio(input)) {
-        return Err(CliError::usage("the structure and the map cannot both be read from stdin"));
+    if map.is_some_and(|map| reads_stdin && is_stdio(map)) {
+        return Err(CliError::usage("the input and the map cannot both be read from stdin"));
     }
     match (options.color.is_some_and(|color| color.scheme.needs_map()), map) {
         (true, None) => Err(CliError::usage("`--color map` needs `--map FILE`")),
@@ -184,7 +227,7 @@ mod tests {
     fn request(flags: &[&str]) -> Result<Request, CliError> {
         let line = ["molmesh", "mesh", "in.pdb", "-o", "out.glb"].iter().chain(flags);
         let Command::Mesh(args) = Args::try_parse_from(line).unwrap().command else { panic!("not mesh") };
-        parse_mesh(&args)
+        parse_mesh(&args, false).map(|request| request.mesh)
     }
 
     fn drawn(flags: &[&str]) -> Result<Request, CliError> {

@@ -13,10 +13,11 @@ use molmesh::structure::strict_validator::Diagnostic;
 use super::args::TilesetArgs;
 use super::backend::Purpose;
 use super::error::CliError;
-use super::job::{CommandJob, name_of};
+use super::job::{self, name_of};
 use super::output::is_stdio;
 use super::page::Page;
 use super::report::CommandReport;
+use super::setup::{JobSetup, JobThreads};
 use super::style::Style;
 use super::{interrupt, request, summary};
 
@@ -24,11 +25,17 @@ use super::{interrupt, request, summary};
 pub(super) fn run(args: &TilesetArgs) -> Result<(), CliError> {
     let request = request::parse_tileset(args)?;
     let start = Instant::now();
-    let input = args.inputs.first().map_or(Path::new("-"), PathBuf::as_path);
+    let input = job::first(&args.inputs);
     let scratch = args.scratch.as_deref().map(|scratch| StreamFiles::open(&args.inputs, scratch)).transpose()?;
-    let open = |_: &_| Folder::create(&args.output);
     let streamed_atoms = scratch.as_ref().map(|files| files.atoms);
-    let (job, mut folder) = CommandJob::prepare_for(Purpose::Mesh, request, input, streamed_atoms, &args.job, open)?;
+    let limits = if streamed_atoms.is_some() { request::limits_of_stream } else { request::limits };
+    let limits = limits(&args.job.limits);
+    let mut setup = JobSetup::new(Purpose::Mesh, request, limits, is_stdio(input), &args.job)?;
+    let mut folder = Folder::create(&args.output)?;
+    let bytes = if streamed_atoms.is_some() { Vec::new() } else { setup.read(input)? };
+    setup.read_map()?;
+    let threads = JobThreads::all(args.job.run.threads)?;
+    let job = setup.job(input, bytes, streamed_atoms, &threads, true)?;
     let write = |path: &str, bytes: &[u8]| folder.write(path, bytes);
     let report = match scratch {
         Some(StreamFiles { inputs, scratch, .. }) => {
@@ -40,9 +47,10 @@ pub(super) fn run(args: &TilesetArgs) -> Result<(), CliError> {
     let findings = job.findings.clone();
     // Ends the progress bar.
     drop(job);
-    let (findings, seconds) = (findings.as_deref(), start.elapsed().as_secs_f64());
-    let text = || text(&report, findings, &folder.path, seconds, Style::stderr());
-    CommandReport { report: &report, files: &[], findings }.write(args.job.report, args.job.quiet, text)
+    let (done, seconds) = (CommandReport { report, files: Vec::new(), findings }, start.elapsed().as_secs_f64());
+    done.write(&args.job.run, |done| {
+        text(&done.report, done.findings.as_deref(), &folder.path, seconds, Style::stderr())
+    })
 }
 
 /// Files that are read as a stream.

@@ -75,7 +75,7 @@ fn bad_flags_exit_with_2() {
             "'1MiB' for '--max-atoms <N>': expected a whole number",
         ),
         (&["render", "a.pdb", "-o", "b.png", "--units", "nanometer"], "'--units' is an option of `molmesh mesh`"),
-        (&["mesh", "a.pdb", "-o", "b.glb", "--width", "9"], "'--width' is an option of `molmesh render`"),
+        (&["areas", "a.pdb", "--width", "9"], "'--width' is an option of `molmesh mesh`, `molmesh render`"),
         (&["mesh", "a.pdb", "-o", "b.xyz"], "--format: glb, gltf, ply, ply-text, stl, obj, vtp, vert, face\n"),
         (
             &["mesh", "a.pdb", "-o", "b.glb", "--format", "xyz"],

@@ -35,6 +35,27 @@ fn help_is_stable() {
     snapshot("key_new", &["key", "new", "--help"]);
     snapshot("key_signing", &["key", "signing", "--help"]);
     snapshot("sign", &["sign", "--help"]);
+    snapshot("completions", &["completions", "--help"]);
+    snapshot("man", &["man", "--help"]);
+}
+
+#[test]
+fn help_completions_and_man_pages_know_every_flag() {
+    let help = run(["mesh", "--help"]);
+    assert_eq!(stdout(&run(["help", "mesh"])), stdout(&help));
+    assert_eq!(stdout(&run(["help", "key", "new"])), stdout(&run(["key", "new", "--help"])));
+    for shell in ["bash", "zsh", "fish"] {
+        let script = run(["completions", shell]);
+        assert_code(&script, 0);
+        for word in ["skip-existing", "max-triangles", "healthcheck"] {
+            assert!(stdout(&script).contains(word), "{shell}: no {word}");
+        }
+    }
+    let page = run(["man", "mesh"]);
+    assert_code(&page, 0);
+    assert!(stdout(&page).contains(".TH molmesh-mesh 1") && stdout(&page).contains("\\-\\-max\\-triangles"));
+    assert!(stdout(&run(["man"])).contains("molmesh\\-areas(1)"), "{}", stdout(&run(["man"])));
+    assert_code(&run(["man", "key", "old"]), 2);
 }
 
 #[test]
@@ -42,7 +63,7 @@ fn help_and_guide_list_the_same_exit_codes() {
     let help = stdout(&run(["--help"]));
     let guide = include_str!("../../docs/start/cli.md");
     let codes: Vec<&str> = help.split("Exit codes:\n").nth(1).unwrap().lines().collect();
-    assert_eq!(codes.len(), 10, "{help}");
+    assert_eq!(codes.len(), 11, "{help}");
     for line in codes {
         let (code, meaning) = line.trim().split_once("  ").unwrap();
         let row = format!("| {code} | {} |", meaning.trim());
@@ -60,7 +81,8 @@ fn the_guide_mentions_every_flag_of_mesh() {
         lines.flat_map(str::split_whitespace).filter(|w| w.starts_with("--") && w.len() > 2).collect();
     assert!(flags.len() > 20, "{flags:?}");
     for flag in flags {
-        let flag = flag.trim_end_matches([',', '.', ')', ']', ':']);
+        // `--areas[=<LEVEL>]` has an optional value.
+        let flag = flag.split(['[', '=']).next().unwrap().trim_end_matches([',', '.', ')', ']', ':']);
         if flag != "--help" {
             assert!(guide.contains(flag), "docs/start/cli.md does not mention {flag}");
         }

@@ -17,6 +17,7 @@ mod tools;
 
 mod access;
 mod areas;
+mod batch;
 mod browser;
 mod config_print;
 mod deploy;

@@ -83,7 +83,7 @@ enum CsvField<'a> {
 
 /// Appends a text, in quotes if it contains a separator or a quote. A spreadsheet would execute a text that begins with
 /// one of `=+-@`, a tab or a line end as a formula, so an apostrophe precedes it.
-fn put_text(rows: &mut Vec<u8>, text: &str) {
+pub fn put_text(rows: &mut Vec<u8>, text: &str) {
     let mark = if text.starts_with(['=', '+', '-', '@', '\t', '\r', '\n']) { "'" } else { "" };
     if !text.contains(['"', ',', '\n', '\r']) {
         rows.extend_from_slice(mark.as_bytes());
