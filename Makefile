@@ -9,7 +9,7 @@ SHELL := bash
 CARGO ?= cargo
 ARGS ?=
 
-.PHONY: help run install test interleavings fuzz chaos soak attack nightly nightly-data tools static static-if-possible web web-if-possible fmt fmt-check lint wasm deny audit sbom container tests bench figures gallery release clean
+.PHONY: help run install test interleavings fuzz chaos soak attack nightly nightly-data tools static static-if-possible web web-if-possible fmt fmt-check lint wasm deny audit sbom container tests python-test wheel bench figures gallery release clean
 
 help: ## List the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## (.*)/  make \1\t\2/' | expand -t 26
@@ -20,7 +20,7 @@ run: web-if-possible ## Build (the first time takes minutes) and serve on http:/
 install: web-if-possible ## Install the command molmesh, with the service and its web page, into ~/.cargo/bin
 	$(CARGO) install --path . --locked --profile fast-build
 
-STEPS := web fmt-check lint wasm tools deny static-if-possible interleavings tests
+STEPS := web fmt-check lint wasm tools deny static-if-possible interleavings python-test tests
 
 # The steps add a line to the file SKIPPED for each check that they skip. The step `tests` prints this file; after the
 # failure of another step, it is printed here.
@@ -80,6 +80,20 @@ container: $(if $(BINARY),,release) ## Build and test the images (two to four mi
 
 tests: ## Run only the tests
 	@bash .ci/tests $(if $(PROFILE),$(PROFILE),dev)
+
+# With --workspace, dependencies have the same features as in the tests and are compiled once. The extension has the
+# name with which a wheel would contain it.
+PYTHON := target/test-tools/venv/bin/python
+python-test: ## Build the Python package with the profile of the tests, and run its tests; Linux only (after `make tools`)
+	$(CARGO) build --locked --workspace --lib --target-dir target
+	rm -rf target/python && mkdir -p target/python && cp -R python/molmesh target/python/
+	cp target/debug/lib_molmesh.so target/python/molmesh/_molmesh.abi3.so
+	PYTHONPATH=target/python PYTHONDONTWRITEBYTECODE=1 $(PYTHON) -m pytest -q -p no:cacheprovider python/tests
+
+# Without patchelf, maturin tests which manylinux tag the extension complies with, and uses it.
+wheel: ## Build a wheel of the Python package for this machine into dist/; PROFILE=fast-build takes less time
+	PATH="$(CURDIR)/target/test-tools/venv/bin:$$PATH" maturin build --locked --manifest-path python/Cargo.toml \
+		--profile $(or $(PROFILE),release) --strip --out dist
 
 # The wrapper compiles the libraries with counters that guide the fuzzer. With --workspace, dependencies have the same
 # features as in tests.

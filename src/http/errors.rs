@@ -289,12 +289,54 @@ impl From<SurfaceError> for Problem {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::structure::StructureError;
+    use crate::structure::map::MapError;
     use crate::surface::limit::LIMITS;
 
     #[test]
     fn every_limit_has_a_problem_type() {
         for row in LIMITS {
             assert!(ProblemEntry::find(row.problem).is_some_and(|entry| entry.is_rejection), "{row:?}");
+        }
+    }
+
+    #[test]
+    fn problems_have_the_names_that_errors_of_jobs_state() {
+        let why = String::new;
+        let limit = || Exceeded::new(Limit::GridPoints, 1);
+        let system = OutOfMemory::System { needed: 1 };
+        let structure: [StructureError; 7] = [
+            StructureError::UnknownFormat { found: why() },
+            StructureError::Syntax { line: 1, column: 1, found: why(), expected: why() },
+            StructureError::BadAssembly { id: why(), found: why(), expected: why() },
+            StructureError::NoEntities,
+            StructureError::NoAtoms { found: why() },
+            StructureError::EmptySelection { holds: why() },
+            StructureError::NotFound { what: "chain", requested: why(), available: why() },
+        ];
+        let surface: [SurfaceError; 11] = [
+            SurfaceError::NoSpheres,
+            SurfaceError::BadSphere { index: 0, what: "x", value: 0.0, expected: "" },
+            SurfaceError::BadParameter { name: "probe", value: why(), expected: why() },
+            SurfaceError::NoSurface { isovalue: None },
+            SurfaceError::NoPatch,
+            SurfaceError::NoCavity { probe: 1.4, cavities: 0 },
+            limit().error(),
+            system.into(),
+            OutOfMemory::Limit { needed: 2, limit: 1 }.into(),
+            SurfaceError::Device { why: why() },
+            SurfaceError::Cancelled,
+        ];
+        let others = [
+            JobError::Format(limit().error()),
+            JobError::Format(FormatError::NotQuantized),
+            JobError::Map(MapError::UnknownFormat { found: why() }),
+        ];
+        let errors = structure.into_iter().map(JobError::from).chain(surface.into_iter().map(JobError::from));
+        for error in errors.chain(others) {
+            let name = error.problem();
+            let problem = Problem::from(Failure::Job { error, diagnostics: Vec::new() });
+            assert_eq!(problem.slug(), name);
         }
     }
 

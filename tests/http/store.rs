@@ -203,19 +203,20 @@ async fn replacing_an_object_is_atomic(place: TestStore) {
     let writer = tokio::spawn({
         let (store, bodies) = (store.clone(), bodies.clone());
         async move {
-            for round in 0..12 {
-                store.put(&job(1), bodies[round % 2].clone().into()).await.unwrap();
+            for body in bodies.iter().cycle() {
+                store.put(&job(1), body.clone().into()).await.unwrap();
             }
         }
     });
     let mut seen = [0; 2];
-    while !writer.is_finished() {
+    // The writer goes on until readers have met each object, on a busy machine too.
+    while seen.iter().sum::<i32>() < 8 || seen.contains(&0) {
         let read = get(&store, &job(1)).await.unwrap();
         let which = bodies.iter().position(|body| *body == read);
         seen[which.unwrap_or_else(|| panic!("{} bytes that were never written", read.len()))] += 1;
     }
-    writer.await.unwrap();
-    assert!(seen.iter().all(|&n| n > 0), "readers saw only one of them: {seen:?}");
+    writer.abort();
+    assert!(writer.await.unwrap_err().is_cancelled());
 }
 
 async fn a_written_object_appears_when_finished(place: TestStore) {

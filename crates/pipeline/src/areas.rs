@@ -12,8 +12,7 @@ use molmesh_surface::{
 };
 use serde::Serialize;
 
-pub use self::table::AreaLevel;
-use self::table::Row;
+pub use self::table::{AreaLevel, AreaRow};
 use super::load::{LoadedStructure, SPHERE_BYTES, load};
 use super::{JobError, LeftOut, Options, StageClock, WorkScope};
 
@@ -226,7 +225,7 @@ fn whole(
         interface: None,
     };
     let areas = AtomAreas { atoms: selected.atoms.clone(), areas: whole.of_spheres, alone: None, has_parts };
-    let chain = |Row { first, atoms, parts, .. }| ChainArea {
+    let chain = |AreaRow { first, atoms, parts, .. }| ChainArea {
         chain: structure.chain.get(first).to_owned(),
         atoms,
         area: round(parts.total()),

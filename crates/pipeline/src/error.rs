@@ -4,7 +4,7 @@ use molmesh_formats::FormatError;
 use molmesh_picture::PictureError;
 use molmesh_structure::StructureError;
 use molmesh_structure::map::MapError;
-use molmesh_surface::SurfaceError;
+use molmesh_surface::{OutOfMemory, SurfaceError};
 use thiserror::Error;
 
 use super::ColorError;
@@ -30,6 +30,66 @@ pub enum JobError {
     /// The mesh cannot be compressed.
     #[error(transparent)]
     Format(#[from] FormatError),
+}
+
+impl JobError {
+    /// Returns the name of the problem type with which the service answers.
+    #[must_use]
+    pub fn problem(&self) -> &'static str {
+        match self {
+            Self::Structure(error) => structure_problem(error),
+            Self::Surface(error) => surface_problem(error),
+            Self::Color(_) => "bad-parameter",
+            Self::Map(_) => "unreadable-map",
+            Self::Format(FormatError::Limit(error)) => error.limit.row().problem,
+            Self::Picture(_) | Self::Format(_) => "internal",
+        }
+    }
+}
+
+fn structure_problem(error: &StructureError) -> &'static str {
+    use StructureError as E;
+    match error {
+        E::Input { .. }
+        | E::NotAStream { .. }
+        | E::UnknownFormat { .. }
+        | E::Syntax { .. }
+        | E::Malformed { .. }
+        | E::Decompress { .. }
+        | E::BadAssembly { .. } => "unreadable-structure",
+        E::NoAtoms { .. } => "no-atoms",
+        E::EmptySelection { .. } | E::NotFound { .. } => "empty-selection",
+        E::NoEntities => "bad-parameter",
+        E::Limit(error) => error.limit.row().problem,
+        E::Memory(error) | E::DiskSpace(error) => memory_problem(error),
+        E::DiskFull => "store-full",
+        E::Scratch { .. } => "internal",
+        E::Cancelled => "shutting-down",
+    }
+}
+
+fn surface_problem(error: &SurfaceError) -> &'static str {
+    use SurfaceError as E;
+    match error {
+        E::NoSpheres => "no-atoms",
+        E::BadSphere { .. } => "unreadable-structure",
+        E::BadParameter { .. } => "bad-parameter",
+        E::NoSurface { .. } | E::NoPatch | E::NoCavity { .. } => "no-surface",
+        E::Limit(error) => error.limit.row().problem,
+        E::Memory(error) => memory_problem(error),
+        E::Device { .. } => "device-failed",
+        E::Deadline => "deadline",
+        E::Cancelled => "shutting-down",
+        E::Sink => "internal",
+    }
+}
+
+const fn memory_problem(error: &OutOfMemory) -> &'static str {
+    match error {
+        OutOfMemory::Budget { .. } | OutOfMemory::System { .. } => "memory-full",
+        OutOfMemory::Share { .. } => "share-exceeded",
+        OutOfMemory::Limit { .. } => "too-much-memory",
+    }
 }
 
 impl From<StructureError> for JobError {

@@ -36,7 +36,7 @@ mod work;
 use std::ops::Deref;
 use std::sync::Arc;
 
-pub use areas::{AreaLevel, ExactReport, Interface, InterfaceReport, MeasuredSelection, SelectionMeasures};
+pub use areas::{AreaLevel, AreaRow, ExactReport, Interface, InterfaceReport, MeasuredSelection, SelectionMeasures};
 pub use auto::AutoBackend;
 pub use cavities::{Cavities, CavityReport, LiningResidue};
 pub use clock::{ProgressSink, StageClock, WorkScope};

@@ -49,6 +49,7 @@ pub mod select;
 mod sites;
 mod sniff;
 mod source;
+mod spheres;
 mod split;
 mod stored;
 pub mod stream;
@@ -76,6 +77,7 @@ pub use select::{
     SelectedOfBlock, Selection, select, select_with,
 };
 pub use source::{SourceFormat, Unread};
+pub use spheres::of_spheres;
 pub use split::{AtomPart, Split};
 pub use survey::{Survey, survey};
 pub use texts::TextColumn;

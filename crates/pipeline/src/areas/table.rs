@@ -22,13 +22,17 @@ pub enum AreaLevel {
 
 named!(AreaLevel, Atom => "atom", Residue => "residue", Chain => "chain");
 
-/// Row of a table: some atoms with the sums of their areas.
-pub(super) struct Row {
+/// Row of a table: some atoms with the sums of their areas, Å².
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct AreaRow {
     /// Index of the first atom in the structure.
-    pub(super) first: usize,
-    pub(super) atoms: u64,
-    pub(super) parts: AreaParts,
-    alone: f64,
+    pub first: usize,
+    /// Number of atoms.
+    pub atoms: u64,
+    /// Area. It is the sum of three parts for a solvent-excluded surface, and one part otherwise.
+    pub parts: AreaParts,
+    /// Area without the other side; with an interface only.
+    pub alone: Option<f64>,
 }
 
 impl AtomAreas {
@@ -44,19 +48,25 @@ impl AtomAreas {
         self.atoms.is_empty()
     }
 
+    /// Returns true if the areas have parts: those of a solvent-excluded surface.
+    #[must_use]
+    pub fn has_parts(&self) -> bool {
+        self.has_parts
+    }
+
     /// Returns the rows of a table. Chains are in the order of their first atoms, and contain all copies. A residue
     /// ends with its last consecutive atom. The rows are charged to `memory`.
     ///
     /// # Errors
     /// Fails if the memory budget is used up, or the work is cancelled.
-    pub(super) fn rows(
+    pub fn rows(
         &self,
         structure: &Structure,
         level: AreaLevel,
         control: &Control<'_>,
         memory: &Reservation,
-    ) -> Result<Vec<Row>, SurfaceError> {
-        let mut rows: Vec<Row> = Vec::new();
+    ) -> Result<Vec<AreaRow>, SurfaceError> {
+        let mut rows: Vec<AreaRow> = Vec::new();
         let mut of_chains = FxHashMap::default();
         let mut before = None;
         for (n, &atom) in self.atoms.iter().enumerate() {
@@ -76,11 +86,14 @@ impl AtomAreas {
             };
             if row == rows.len() {
                 memory.reserve_rows(&mut rows, 1)?;
-                rows.push(Row { first: i, atoms: 0, parts: AreaParts::default(), alone: 0.0 });
+                let alone = self.alone.as_ref().map(|_| 0.0);
+                rows.push(AreaRow { first: i, atoms: 0, parts: AreaParts::default(), alone });
             }
             rows[row].atoms += 1;
             rows[row].parts += self.areas[n];
-            rows[row].alone += self.alone.as_ref().map_or(0.0, |alone| alone[n]);
+            if let (Some(sum), Some(alone)) = (&mut rows[row].alone, &self.alone) {
+                *sum += alone[n];
+            }
             before = Some(i);
         }
         Ok(rows)
@@ -116,7 +129,7 @@ impl AtomAreas {
         }
         let memory = Reservation::new(&control.memory);
         let rows = self.rows(structure, level, control, &memory).map_err(io::Error::other)?;
-        table::write_rows(out, &header, rows, |text, Row { first, atoms, parts, alone }| {
+        table::write_rows(out, &header, rows, |text, AreaRow { first, atoms, parts, alone }| {
             table::put_columns(text, structure, first, columns.clone());
             if counts {
                 write!(text, ",{atoms}")?;
@@ -126,7 +139,7 @@ impl AtomAreas {
             if self.has_parts {
                 write!(text, ",{:.4},{:.4},{:.4}", parts.contact, parts.toroidal, parts.concave)?;
             }
-            if self.alone.is_some() {
+            if let Some(alone) = alone {
                 write!(text, ",{alone:.4},{:.4}", alone - area)?;
             }
             Ok(())
