@@ -11,7 +11,7 @@ use pyo3::types::PyDict;
 
 use crate::columns::ColumnData;
 use crate::error::{Failure, parameter_error};
-use crate::parameters::{of_source, pairs, selection_of};
+use crate::parameters::{pairs, selection_of, with_selection};
 use crate::source::Source;
 use crate::work;
 
@@ -71,7 +71,7 @@ pub(crate) fn areas<'py>(
             }
         }
     }
-    let request = parse(&of_source(&source, given)?).map_err(|error| parameter_error(&error))?;
+    let request = parse(&with_selection(&source, given)?).map_err(|error| parameter_error(&error))?;
     let columns = work::run(py, progress, "read", move |control, tracker| {
         let AreasRequest { options, level, .. } = request;
         let JobLimits { read, surface, .. } = JobLimits::default();
@@ -100,18 +100,19 @@ fn names(structure: &Structure, level: AreaLevel, rows: &[AreaRow]) -> Result<Ta
     if level == AreaLevel::Atom {
         #[expect(clippy::cast_possible_truncation, reason = "indices of atoms have 32 bits")]
         let indices: Vec<u32> = atoms().map(|i| i as u32).collect();
-        table.push(("index", ColumnData::of(indices)));
+        table.push(("index", ColumnData::from_numbers(indices)));
         table.push(("name", ColumnData::texts(atoms().map(|i| structure.name.get(i)))?));
         table.push(("element", ColumnData::texts(atoms().map(|i| element::symbol(structure.element[i])))?));
     }
     if level != AreaLevel::Chain {
         let codes: Vec<String> = atoms().map(|i| structure.insertion_code[i]).map(code).collect();
         table.push(("residue_name", ColumnData::texts(atoms().map(|i| structure.residue.get(i)))?));
-        table.push(("residue_number", ColumnData::of(atoms().map(|i| structure.residue_number[i]).collect())));
+        table
+            .push(("residue_number", ColumnData::from_numbers(atoms().map(|i| structure.residue_number[i]).collect())));
         table.push(("insertion_code", ColumnData::texts(codes.iter().map(String::as_str))?));
     }
     table.push(("chain", ColumnData::texts(atoms().map(|i| structure.chain.get(i)))?));
-    table.push(("model", ColumnData::of(atoms().map(|i| structure.model[i]).collect())));
+    table.push(("model", ColumnData::from_numbers(atoms().map(|i| structure.model[i]).collect())));
     Ok(table)
 }
 
@@ -122,10 +123,11 @@ fn code(code: u8) -> String {
 
 /// Returns the columns of numbers.
 fn numbers(level: AreaLevel, rows: &[AreaRow], has_parts: bool) -> Table {
-    let column = |value: &dyn Fn(&AreaRow) -> f64| ColumnData::of(rows.iter().map(value).collect::<Vec<f64>>());
+    let column =
+        |value: &dyn Fn(&AreaRow) -> f64| ColumnData::from_numbers(rows.iter().map(value).collect::<Vec<f64>>());
     let mut table = Vec::new();
     if level != AreaLevel::Atom {
-        table.push(("atoms", ColumnData::of(rows.iter().map(|row| row.atoms).collect::<Vec<u64>>())));
+        table.push(("atoms", ColumnData::from_numbers(rows.iter().map(|row| row.atoms).collect::<Vec<u64>>())));
     }
     let area = |row: &AreaRow| AreaParts::total(&row.parts);
     table.push(("area", column(&area)));

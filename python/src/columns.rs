@@ -64,17 +64,17 @@ fn type_name(name: &str) -> String {
 
 impl ColumnData {
     /// Takes a column of numbers.
-    pub(crate) fn of<T: Number>(rows: Vec<T>) -> Self {
+    pub(crate) fn from_numbers<T: Number>(rows: Vec<T>) -> Self {
         Self::new::<T>(vec![rows.len()], Arc::new(OwnedRows(rows)))
     }
 
     /// Takes a column of rows of `N` numbers.
-    pub(crate) fn of_rows<T: Number, const N: usize>(rows: Vec<[T; N]>) -> Self {
+    pub(crate) fn from_rows<T: Number, const N: usize>(rows: Vec<[T; N]>) -> Self {
         Self::new::<T>(vec![rows.len(), N], Arc::new(OwnedRows(rows.into_flattened())))
     }
 
     /// Refers to a column of a mesh, whose rows have `width` numbers.
-    pub(crate) fn of_mesh<T: Number>(mesh: &Arc<Mesh>, width: usize, bytes: fn(&Mesh) -> &[u8]) -> Self {
+    pub(crate) fn from_mesh<T: Number>(mesh: &Arc<Mesh>, width: usize, bytes: fn(&Mesh) -> &[u8]) -> Self {
         let n = bytes(mesh).len() / (width * size_of::<T>());
         Self::new::<T>(vec![n, width], Arc::new(MeshRows { mesh: Arc::clone(mesh), bytes }))
     }

@@ -58,7 +58,8 @@ impl PyMesh {
     ) -> Result<Self, Failure> {
         let Product { mut mesh, bounds, storage, report, .. } = product;
         mesh.make_contiguous();
-        let atom = mesh.atom_ids.is_some().then(|| atoms.rows_of(&mesh, control)).transpose()?.map(ColumnData::of);
+        let atom =
+            mesh.atom_ids.is_some().then(|| atoms.rows_of(&mesh, control)).transpose()?.map(ColumnData::from_numbers);
         let content = MeshContent { mesh: Arc::new(mesh), storage, bounds, is_meshopt, report, atom };
         let (vertices, normals, report) = (OnceLock::new(), OnceLock::new(), PyOnceLock::new());
         Ok(Self { content: Arc::new(content), vertices, normals, report })
@@ -142,24 +143,24 @@ impl PyMesh {
     fn vertices<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
         #[expect(clippy::cast_possible_truncation, reason = "vertices are f32")]
         let row = |vertex| absolute(&self.content.mesh, vertex).map(|v| v as f32);
-        let make = || ColumnData::of_rows((0..self.content.mesh.n_vertices()).map(row).collect());
+        let make = || ColumnData::from_rows((0..self.content.mesh.n_vertices()).map(row).collect());
         py.detach(|| self.vertices.get_or_init(make)).array(py)
     }
 
     /// Triangles as indices of vertices, uint32 (k, 3).
     #[getter]
     fn faces<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
-        ColumnData::of_mesh::<u32>(&self.content.mesh, 3, |mesh| bytemuck::cast_slice(&mesh.triangles)).array(py)
+        ColumnData::from_mesh::<u32>(&self.content.mesh, 3, |mesh| bytemuck::cast_slice(&mesh.triangles)).array(py)
     }
 
     /// Unit normals of the vertices, pointing outwards, float32 (m, 3).
     #[getter]
     fn normals<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
         let make = || match &self.content.mesh.quantized {
-            None => ColumnData::of_mesh::<f32>(&self.content.mesh, 3, |mesh| bytemuck::cast_slice(&mesh.normals)),
+            None => ColumnData::from_mesh::<f32>(&self.content.mesh, 3, |mesh| bytemuck::cast_slice(&mesh.normals)),
             Some(quantized) => {
                 let row = |[x, y, z, _]: &[i8; 4]| [*x, *y, *z].map(|v| f32::from(v) / 127.0);
-                ColumnData::of_rows(quantized.normals.iter().map(row).collect())
+                ColumnData::from_rows(quantized.normals.iter().map(row).collect())
             }
         };
         py.detach(|| self.normals.get_or_init(make)).array(py)
@@ -181,7 +182,7 @@ impl PyMesh {
     fn colors<'py>(&self, py: Python<'py>) -> PyResult<Option<Bound<'py, PyAny>>> {
         let mesh = &self.content.mesh;
         let column = || {
-            ColumnData::of_mesh::<u8>(mesh, 4, |mesh| mesh.colors.as_deref().map_or(&[], |rows| rows.as_flattened()))
+            ColumnData::from_mesh::<u8>(mesh, 4, |mesh| mesh.colors.as_deref().map_or(&[], |rows| rows.as_flattened()))
         };
         mesh.colors.is_some().then(|| column().array(py)).transpose()
     }
@@ -268,7 +269,7 @@ impl PyMesh {
     fn to_trimesh<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
         let arguments = PyDict::new(py);
         let mesh = &self.content.mesh;
-        let make = || ColumnData::of_rows((0..mesh.n_vertices()).map(|vertex| absolute(mesh, vertex)).collect());
+        let make = || ColumnData::from_rows((0..mesh.n_vertices()).map(|vertex| absolute(mesh, vertex)).collect());
         arguments.set_item("vertices", py.detach(make).array(py)?)?;
         arguments.set_item("faces", self.faces(py)?)?;
         arguments.set_item("vertex_normals", self.normals(py)?)?;

@@ -52,7 +52,7 @@ fn scalar(value: &Bound<'_, PyAny>) -> PyResult<String> {
 ///
 /// # Errors
 /// Returns `ValueError` for a selection from atoms that are already selected.
-pub(crate) fn of_source(source: &Source, given: Pairs) -> PyResult<Pairs> {
+pub(crate) fn with_selection(source: &Source, given: Pairs) -> PyResult<Pairs> {
     let Some((selection, why)) = source.selection() else { return Ok(given) };
     match given.iter().find(|(name, _)| READ.contains(&name.as_str())) {
         Some((name, _)) => Err(PyValueError::new_err(format!("parameter `{name}` cannot be set here: {why}"))),
@@ -70,7 +70,7 @@ pub(crate) fn parse(source: &Source, given: Pairs, format: Format) -> PyResult<R
                        and render() returns a PNG";
         return Err(PyValueError::new_err(message));
     }
-    let request = params::parse_with(of_source(source, given)?, |_| Ok::<_, ParamError>(format))
+    let request = params::parse_with(with_selection(source, given)?, |_| Ok::<_, ParamError>(format))
         .map_err(|error| parameter_error(&error))?;
     match request.options.color.map(|color| color.scheme) {
         None | Some(Scheme::Uniform(_) | Scheme::Vertex(_)) => Ok(request),

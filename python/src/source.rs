@@ -7,7 +7,7 @@ use std::sync::Arc;
 
 use molmesh_pipeline::{ProgressSink as _, Tracker};
 use molmesh_structure::strict_validator::{self, Level};
-use molmesh_structure::{Context, ReadLimits, Selected, Selection, Structure, of_spheres, read_with, select_with};
+use molmesh_structure::{Context, ReadLimits, Selected, Selection, Structure, from_spheres, read_with, select_with};
 use molmesh_surface::spheres::MAX_COORDINATE;
 use molmesh_surface::{Control, Exceeded, Limit, Spheres, SurfaceError};
 use pyo3::exceptions::{PyTypeError, PyValueError};
@@ -114,7 +114,7 @@ impl Source {
         tracker.progress("read", 0.0);
         let structure = match self {
             Self::Atoms(atoms) => return Ok(atoms),
-            Self::Spheres(spheres) => of_spheres(&spheres, &limits, control)?,
+            Self::Spheres(spheres) => from_spheres(&spheres, &limits, control)?,
             Self::Content(content) => {
                 let bytes = content.read(Limit::InflatedBytes, limits.max_inflated_bytes)?;
                 read(bytes.as_ref(), strict, &limits, control)?

@@ -84,14 +84,14 @@ impl PyStructure {
     #[getter]
     fn coordinates<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
         self.column(py, &self.columns.coordinates, |atoms| {
-            Ok(ColumnData::of_rows((0..atoms.spheres.len()).map(|i| atoms.spheres.centre(i)).collect()))
+            Ok(ColumnData::from_rows((0..atoms.spheres.len()).map(|i| atoms.spheres.centre(i)).collect()))
         })
     }
 
     /// Van der Waals radii of the file or of the elements, float32 (n,), Å.
     #[getter]
     fn radii<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
-        self.column(py, &self.columns.radii, |atoms| Ok(ColumnData::of(atoms.spheres.radii().to_vec())))
+        self.column(py, &self.columns.radii, |atoms| Ok(ColumnData::from_numbers(atoms.spheres.radii().to_vec())))
     }
 
     /// Symbols of the elements, str (n,); ``?`` if unknown.
@@ -138,7 +138,7 @@ impl PyStructure {
             return Ok(None);
         }
         self.column(py, &self.columns.b_factors, |atoms| {
-            Ok(ColumnData::of(atoms.rows(|structure, i| structure.b_factor[i])))
+            Ok(ColumnData::from_numbers(atoms.rows(|structure, i| structure.b_factor[i])))
         })
         .map(Some)
     }
@@ -146,7 +146,7 @@ impl PyStructure {
     /// Indices of the atoms in the file, from 0, uint32 (n,). Mesh files contain these indices.
     #[getter]
     fn indices<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
-        self.column(py, &self.columns.indices, |atoms| Ok(ColumnData::of(atoms.selected.atoms.clone())))
+        self.column(py, &self.columns.indices, |atoms| Ok(ColumnData::from_numbers(atoms.selected.atoms.clone())))
     }
 
     /// Numbers of the atoms that are not selected, by reason.

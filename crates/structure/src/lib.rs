@@ -77,7 +77,7 @@ pub use select::{
     SelectedOfBlock, Selection, select, select_with,
 };
 pub use source::{SourceFormat, Unread};
-pub use spheres::of_spheres;
+pub use spheres::from_spheres;
 pub use split::{AtomPart, Split};
 pub use survey::{Survey, survey};
 pub use texts::TextColumn;

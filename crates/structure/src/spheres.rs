@@ -13,7 +13,11 @@ use super::source::{SourceFields, SourceFormat};
 ///
 /// # Errors
 /// Returns the errors of limits, memory and cancellation.
-pub fn of_spheres(spheres: &Spheres, limits: &ReadLimits, control: &Control<'_>) -> Result<Structure, StructureError> {
+pub fn from_spheres(
+    spheres: &Spheres,
+    limits: &ReadLimits,
+    control: &Control<'_>,
+) -> Result<Structure, StructureError> {
     limits.check_atoms(spheres.len())?;
     let reading = Reading::new(limits, control);
     let mut rows = Rows::new(&reading, spheres.len());
@@ -36,12 +40,12 @@ mod tests {
     fn the_default_selection_takes_all_spheres_in_their_order() {
         let column = |n: f64| (0..3).map(|i| f64::from(i) * n).collect::<Vec<f64>>();
         let spheres = Spheres::new(column(1.0), column(2.0), column(-3.0), vec![1.0, 2.5, 1.0]).unwrap();
-        let structure = of_spheres(&spheres, &ReadLimits::default(), &Control::default()).unwrap();
+        let structure = from_spheres(&spheres, &ReadLimits::default(), &Control::default()).unwrap();
         let selected = select(&structure, &Selection::default()).unwrap();
         assert_eq!((selected.atoms.as_slice(), selected.left_out.total), (&[0, 1, 2][..], 0));
         assert_eq!(selected.spheres(&structure).unwrap(), spheres);
         assert_eq!(structure.warnings, Vec::<String>::new());
         let few = ReadLimits { max_atoms: 2, ..ReadLimits::default() };
-        assert!(matches!(of_spheres(&spheres, &few, &Control::default()), Err(StructureError::Limit(_))));
+        assert!(matches!(from_spheres(&spheres, &few, &Control::default()), Err(StructureError::Limit(_))));
     }
 }
