@@ -63,7 +63,15 @@ impl ParameterFlag {
 
 /// Writes the parameters that a text names as flags: `exact=true` as `--exact`, `max_triangles` as `max-triangles`.
 fn with_flags(text: &str) -> String {
+    // Each start of the program builds the help, so words that cannot change are not looked up.
+    let may_change = |word: &str| word.contains(['=', '_']);
+    if !may_change(text) {
+        return text.to_owned();
+    }
     let word = |word: &str| {
+        if !may_change(word) {
+            return word.to_owned();
+        }
         let stem = word.trim_end_matches(['.', ',', ';', ':']);
         let (name, value) = stem.split_once('=').map_or((stem, None), |(name, value)| (name, Some(value)));
         if TABLE.iter().all(|parameter| parameter.name != name) {
