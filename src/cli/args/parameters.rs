@@ -64,7 +64,7 @@ impl ParameterFlag {
 /// Writes the parameters that a text names as flags: `exact=true` as `--exact`, `max_triangles` as `max-triangles`.
 fn with_flags(text: &str) -> String {
     // Each start of the program builds the help, so words that cannot change are not looked up.
-    let may_change = |word: &str| word.contains(['=', '_']);
+    let may_change = |word: &str| memchr::memchr2(b'=', b'_', word.as_bytes()).is_some();
     if !may_change(text) {
         return text.to_owned();
     }
