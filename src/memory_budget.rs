@@ -62,10 +62,14 @@ impl Budget {
         Self { per_request, shares: MemoryShares::new(share), ..Self::new(limit) }
     }
 
-    /// Creates a budget of `limit` bytes of temporary files.
+    /// Creates a budget of `limit` bytes of temporary files, with the `share` of a client.
     #[must_use]
-    pub fn of_disk(limit: u64) -> Self {
-        Self { gauges: Gauges { used: SCRATCH_BYTES, held: None }, ..Self::new(limit) }
+    pub fn of_disk(limit: u64, share: f64) -> Self {
+        Self {
+            shares: MemoryShares::new(share),
+            gauges: Gauges { used: SCRATCH_BYTES, held: None },
+            ..Self::new(limit)
+        }
     }
 
     /// Creates a budget of `limit` bytes that is a part of this one: its reservations count in both.

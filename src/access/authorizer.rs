@@ -114,6 +114,18 @@ impl Access {
         forwarded::client(peer, values, self.trusted_proxies.as_ref())
     }
 
+    /// Returns true if the address that [`client`](Self::client) returns is that of one client; see
+    /// [`forwarded::is_single`].
+    pub(crate) fn is_single_client<'a>(
+        &self,
+        peer: IpAddr,
+        values: impl DoubleEndedIterator<Item = &'a str>,
+        is_forwarded: bool,
+    ) -> bool {
+        let trusted = self.trusted_proxies.as_ref();
+        forwarded::is_single(peer, forwarded::client(peer, values, trusted), is_forwarded, trusted)
+    }
+
     /// Reads the key file again if it has changed, or always with `force`. Returns the number of keys, or `None` if the
     /// file was not read. An error keeps the previous keys; an invalid file is reported once until it changes.
     pub(crate) fn refresh(&self, force: bool) -> Result<Option<usize>, AccessError> {

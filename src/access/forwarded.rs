@@ -28,6 +28,13 @@ pub(crate) fn client<'a>(
     client
 }
 
+/// Returns true if `client`, which [`client`] has returned for a request from `peer`, stands for one client and not for
+/// all clients of a proxy. `is_forwarded` is true if the request has a header of a proxy.
+pub(crate) fn is_single(peer: IpAddr, client: IpAddr, is_forwarded: bool, trusted: Option<&Proxies>) -> bool {
+    let is_proxy = trusted.is_some_and(|trusted| trusted.contains(client));
+    !is_proxy && (client != peer.to_canonical() || !is_forwarded)
+}
+
 /// Parses an address with optional brackets and port.
 fn address(text: &str) -> Option<IpAddr> {
     let bare = text.strip_prefix('[').and_then(|rest| rest.strip_suffix(']')).unwrap_or(text);
@@ -66,5 +73,23 @@ mod tests {
         }
         let untrusted = client("10.0.0.1".parse().unwrap(), ["198.51.100.1"].into_iter(), None);
         assert_eq!(untrusted.to_string(), "10.0.0.1");
+    }
+
+    #[test]
+    fn an_address_of_a_proxy_stands_for_many_clients() {
+        let trusted: Proxies = "10.0.0.0/8".parse().unwrap();
+        for (peer, values, is_forwarded, trusted, expected) in [
+            ("203.0.113.9", &[][..], false, None, true),
+            ("203.0.113.9", &["198.51.100.1"], true, None, false),
+            ("203.0.113.9", &["198.51.100.1"], true, Some(&trusted), false),
+            ("10.0.0.1", &["198.51.100.1"], true, Some(&trusted), true),
+            ("10.0.0.1", &[], false, Some(&trusted), false),
+            ("10.0.0.1", &["10.0.0.2"], true, Some(&trusted), false),
+            ("10.0.0.1", &["unknown"], true, Some(&trusted), false),
+        ] {
+            let peer: IpAddr = peer.parse().unwrap();
+            let found = client(peer, values.iter().copied(), trusted);
+            assert_eq!(is_single(peer, found, is_forwarded, trusted), expected, "{peer} {values:?}");
+        }
     }
 }

@@ -54,8 +54,9 @@ section! {
     /// also before a request is rejected for lack of memory. 0 keeps none.
     structure_cache_bytes: u64 = 512 << 20;
     /// Maximum size of temporary files in `server.data_dir`, bytes. They hold the indexes of tilesets that are larger
-    /// than `structure_cache_bytes`. Default 4 GiB: about 80 million atoms at 48 bytes, with their groups. At the
-    /// limit, the least recently used index that is not in use is removed. 0 rejects such tilesets.
+    /// than `structure_cache_bytes`, and archives of batches until their jobs are accepted. Default 4 GiB: about 80
+    /// million atoms at 48 bytes, with their groups. At the limit, the least recently used index that is not in use is
+    /// removed. 0 rejects such tilesets and archives.
     scratch_bytes: u64 = 4 << 30;
     /// Width and height of a picture, pixels. Fixed: at 40 bytes a pixel the largest picture needs 640 MiB, and
     /// rendering takes seconds.

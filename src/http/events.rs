@@ -22,9 +22,9 @@ use super::stop::{self, Stop};
 use crate::jobs::{JobId, JobView};
 
 /// `Last-Event-ID`.
-const LAST_EVENT_ID: HeaderName = HeaderName::from_static("last-event-id");
+pub(super) const LAST_EVENT_ID: HeaderName = HeaderName::from_static("last-event-id");
 /// Id of the final event, on every node. Ids of other events are numbers.
-const FINAL_ID: &str = "end";
+pub(super) const FINAL_ID: &str = "end";
 
 /// State of one event stream.
 struct Listener {

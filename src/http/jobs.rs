@@ -114,7 +114,7 @@ pub(super) struct Link {
 #[serde(rename_all = "lowercase")]
 #[schema(as = JobStatus)]
 #[expect(dead_code, reason = "for the schema alone: documents hold the status of the record")]
-enum StatusSchema {
+pub(super) enum StatusSchema {
     Accepted,
     Running,
     Successful,
@@ -263,8 +263,13 @@ fn answer(status: StatusCode, view: &JobView, wait: Option<Duration>) -> Respons
     response
 }
 
+/// Returns a link to a resource of this media type.
+pub(super) fn link(rel: &'static str, href: String, media_type: &'static str) -> Link {
+    Link { rel, href, r#type: media_type }
+}
+
 /// Returns the problem of a failed job. Its instance is the request that created the job.
-fn problem(record: &JobRecord) -> Option<Value> {
+pub(super) fn problem(record: &JobRecord) -> Option<Value> {
     let mut problem = record.problem.clone()?;
     let request = record.requester.request.as_deref().unwrap_or(record.id.as_str());
     problem.as_object_mut()?.insert("instance".to_owned(), request.into());
@@ -275,10 +280,12 @@ fn problem(record: &JobRecord) -> Option<Value> {
 pub(super) fn document(view: &JobView) -> JobDocument {
     let record = &view.record;
     let own = format!("/v1/jobs/{}", record.id.as_str());
-    let link = |rel, href: String, kind| Link { rel, href, r#type: kind };
     let mut links = vec![link("self", own.clone(), "application/json")];
     if !record.status.is_final() {
         links.push(link("monitor", format!("{own}/events"), "text/event-stream"));
+    }
+    if let Some(batch) = &record.batch {
+        links.push(link("collection", format!("/v1/batches/{}", batch.as_str()), "application/json"));
     }
     if let Some(key) = &record.result {
         let results = "http://www.opengis.net/def/rel/ogc/1.0/results";

@@ -280,6 +280,7 @@ impl MeshRequest {
             parameters: pairs.clone(),
             format: request.format,
             idempotency_key: self.preferences.idempotency_key.clone(),
+            batch: None,
         })
     }
 

@@ -34,6 +34,7 @@ mod reading;
 
 // Requests: preferences, bodies, structures, parameters.
 mod atom_parameters;
+mod batch_plan;
 mod body_hasher;
 mod color_parameters;
 mod form;
@@ -65,12 +66,23 @@ mod colors;
 mod estimate;
 mod events;
 mod health;
+mod job_list;
 mod meshes;
 mod metrics;
 mod page;
 mod problems;
 mod structures;
 mod tilesets;
+
+// Batches.
+mod batch_archive;
+mod batch_state;
+
+mod batch_request;
+
+mod batches;
+
+mod batch_results;
 
 mod capabilities;
 

@@ -13,8 +13,8 @@ use super::problem::Problem;
 use super::problem_types::ProblemType;
 use super::state::Shared;
 use super::{
-    api_document, areas, atoms, capabilities, colors, estimate, events, health, jobs, meshes, page, problems, results,
-    structures, tilesets,
+    api_document, areas, atoms, batch_results, batches, capabilities, colors, estimate, events, health, job_list, jobs,
+    meshes, page, problems, results, structures, tilesets,
 };
 use crate::access::Scope;
 
@@ -42,8 +42,14 @@ pub(super) enum Parameters {
     Colors,
     /// Parameters of a tileset or its subtree.
     Tileset,
+    /// Parameters of a list of jobs.
+    Jobs,
     /// `wait`.
     Wait,
+    /// Parameters of a batch.
+    Batch,
+    /// Page of a list.
+    Page,
     None,
 }
 
@@ -100,10 +106,17 @@ operations! {
         POST "/v1/estimate" MESH Mesh estimate::create;
         POST "/v1/structures" MESH None structures::create;
         GET "/v1/structures/{digest}" READ None structures::show;
+        POST "/v1/areas" MESH Areas areas::create;
+        GET "/v1/jobs" READ Jobs job_list::list;
         GET "/v1/jobs/{id}" READ Wait jobs::show;
         DELETE "/v1/jobs/{id}" MESH None jobs::dismiss;
         GET "/v1/jobs/{id}/events" READ None events::show;
         GET "/v1/jobs/{id}/result" READ None jobs::result;
+        POST "/v1/batches" MESH Batch batches::create;
+        GET "/v1/batches/{id}" READ Page batches::show;
+        DELETE "/v1/batches/{id}" MESH None batches::dismiss;
+        GET "/v1/batches/{id}/events" READ None batches::events;
+        GET "/v1/batches/{id}/results.tar" READ None batch_results::show;
         GET "/v1/results/{file}" READ None results::show;
         GET "/v1/results/{key}/report.json" READ None results::report;
         GET "/v1/capabilities" READ None capabilities::show;

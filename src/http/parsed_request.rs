@@ -35,10 +35,44 @@ impl FromRequestParts<Shared> for Pairs {
     }
 }
 
+/// Parameters of an operation whose body is a structure or names one.
+pub(super) trait BodyParameters: Sized {
+    /// Checks the parameters of the query if the body may have more of them.
+    fn check(pairs: &[(String, String)]) -> Result<(), Problem>;
+
+    /// Parses all parameters.
+    fn parse(
+        app: &App,
+        pairs: &[(String, String)],
+        headers: &HeaderMap,
+        map: Option<&UploadedMap>,
+    ) -> Result<Self, Problem>;
+}
+
+impl BodyParameters for Request {
+    fn check(pairs: &[(String, String)]) -> Result<(), Problem> {
+        params::parse(pairs.iter().map(|(n, v)| (n, v)))?;
+        Ok(())
+    }
+
+    fn parse(
+        app: &App,
+        pairs: &[(String, String)],
+        headers: &HeaderMap,
+        map: Option<&UploadedMap>,
+    ) -> Result<Self, Problem> {
+        let pairs = pairs.iter().map(|(n, v)| (n, v));
+        let mut request = params::parse_with(pairs, |_| negotiate::format(headers))?;
+        request.options.map = map.map(|map| MapFile::new(map.digest.to_string(), map.bytes.clone()));
+        app.check_options(&request.options)?;
+        Ok(request)
+    }
+}
+
 /// Structure and parameters of a request.
-pub(super) struct ParsedRequest {
+pub(super) struct ParsedRequest<R = Request> {
     pub(super) source: StructureSource,
-    pub(super) request: Request,
+    pub(super) request: R,
     /// Map of the job.
     pub(super) map: Option<UploadedMap>,
     /// Parameters as the client wrote them.
@@ -58,7 +92,9 @@ impl ParsedRequest {
         app.check_options(&request.options)?;
         Ok(Self { source, request, map: None, pairs, declared: DeclaredType::Neutral })
     }
+}
 
+impl<R: BodyParameters> ParsedRequest<R> {
     /// Receives a body: a structure file, a form with a file and perhaps a map, or a JSON document that names a
     /// structure. Invalid parameters in the query are rejected before the body is received.
     pub(super) async fn from_body(
@@ -69,17 +105,12 @@ impl ParsedRequest {
         body: Body,
     ) -> Result<Self, Problem> {
         let is_json = upload::is_json(headers);
-        let parse = |pairs: &[(String, String)]| {
-            params::parse_with(pairs.iter().map(|(n, v)| (n, v)), |_| negotiate::format(headers))
-        };
         let early = if is_json || upload::is_multipart(headers) {
             // The body has parameters as well.
-            params::parse(pairs.iter().map(|(n, v)| (n, v)))?;
+            R::check(&pairs)?;
             None
         } else {
-            let request = parse(&pairs)?;
-            app.check_options(&request.options)?;
-            Some(request)
+            Some(R::parse(app, &pairs, headers, None)?)
         };
         let (source, fields, declared, map) = if is_json {
             let json = upload::receive_json(app, caller, headers, body).await?;
@@ -99,10 +130,7 @@ impl ParsedRequest {
             request
         } else {
             pairs.extend(fields);
-            let mut request = parse(&pairs)?;
-            request.options.map = map.as_ref().map(|map| MapFile::new(map.digest.to_string(), map.bytes.clone()));
-            app.check_options(&request.options)?;
-            request
+            R::parse(app, &pairs, headers, map.as_ref())?
         };
         Ok(Self { source, request, map, pairs, declared })
     }

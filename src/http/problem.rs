@@ -64,6 +64,11 @@ impl Problem {
         self.kind == kind
     }
 
+    /// Returns true if a later request may succeed.
+    pub(super) fn is_temporary(&self) -> bool {
+        matches!(self.kind.row().status, StatusCode::SERVICE_UNAVAILABLE | StatusCode::FAILED_DEPENDENCY)
+    }
+
     /// Returns the name of the problem type.
     pub(super) fn slug(&self) -> &'static str {
         self.kind.row().slug

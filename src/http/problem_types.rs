@@ -83,6 +83,8 @@ problem_types! {
         "The URL was valid until `expired`. Request a new one from its source.";
     CrossSite = "cross-site", FORBIDDEN, true, "Pages of this origin are not allowed",
         "A web page of another origin made the request. Send an API key, or ask the operator to add the origin to access.cors_origins. If the page belongs to this service, its proxy must pass on the `Host` header.";
+    ClientUnknown = "client-unknown", FORBIDDEN, true, "The client cannot be identified",
+        "The service has no keys and lists jobs by the address of the client, but this address may be that of several clients: a proxy that the service does not know has passed the request on, or a page of another site made it. Ask the operator to configure keys or server.trusted_proxies. A repeated request with the `Idempotency-Key` of a job returns that job.";
     NotFound = "not-found", NOT_FOUND, false, "Not found",
         "No resource has this path. /openapi.yaml lists the operations of the service.";
     NotInArchive = "not-in-archive", NOT_FOUND, false, "The archive has no such entry",
@@ -90,7 +92,7 @@ problem_types! {
     NoSuchStructure = "no-such-structure", NOT_FOUND, false, "There is no such structure",
         "The server has no structure with this digest. Structures are removed some time after their last use. Upload it again with POST /v1/structures.";
     NoSuchJob = "no-such-job", NOT_FOUND, false, "There is no such job",
-        "The server has no job with this id. Jobs are removed some time after their end.";
+        "The server has no job or batch with this id. They are removed some time after their last use.";
     NoResultYet = "no-result-yet", NOT_FOUND, false, "The job has no result yet",
         "The job is queued or running. `GET /v1/jobs/{id}?wait=20` waits for its end; `/v1/jobs/{id}/events` reports its progress.";
     MethodNotAllowed = "method-not-allowed", METHOD_NOT_ALLOWED, false, "Method not allowed",
@@ -110,11 +112,11 @@ problem_types! {
     BodyTooLarge = "body-too-large", PAYLOAD_TOO_LARGE, true, "The request body is too large",
         "The request body exceeds `limit` bytes, or `detail` names the part of it that is too large. Compress the structure with gzip or zstd, or ask the operator to raise the limit that `detail` names.";
     InflatedTooLarge = "inflated-too-large", PAYLOAD_TOO_LARGE, true, "The decompressed file is too large",
-        "The structure or the map exceeds `limit` bytes after decompression.";
+        "The structure, the map or the archive of a batch exceeds `limit` bytes after decompression.";
     EntryTooLarge = "entry-too-large", PAYLOAD_TOO_LARGE, true, "The archive entry is too large",
         "The entry exceeds `limit` bytes as sent by the archive. Ask the operator to put the entry into the folder of archive.dir.";
     UnsupportedMediaType = "unsupported-media-type", UNSUPPORTED_MEDIA_TYPE, false, "The media type does not fit",
-        "`Content-Type` is optional, because the server detects the format from the content. Here the two disagree (`declared` is the header, `found` the detected content), or the body of `POST /v1/structures` is JSON. Only `POST /v1/meshes`, `/v1/report` and `/v1/estimate` take JSON, which names a structure on the server.";
+        "`Content-Type` is optional, because the server detects the format from the content. Here the two disagree (`declared` is the header, `found` the detected content), or the body of `POST /v1/structures` is JSON. Only `POST /v1/meshes`, `/v1/report`, `/v1/estimate`, `/v1/areas` and `/v1/batches` take JSON, which names structures on the server.";
     UnsupportedEncoding = "unsupported-encoding", UNSUPPORTED_MEDIA_TYPE, false, "Unsupported content encoding",
         "`Content-Encoding` must be gzip, zstd or identity, and match the content.";
     RangeNotSatisfiable = "range-not-satisfiable", RANGE_NOT_SATISFIABLE, false, "The range is not satisfiable",
@@ -176,7 +178,7 @@ problem_types! {
     TooManyJobs = "too-many-jobs", SERVICE_UNAVAILABLE, true, "Too many asynchronous jobs are open",
         "The server keeps records of at most `limit` asynchronous jobs, in total or for one client, and none of these jobs has ended. Wait for the end of a job, or cancel one. Retry after `Retry-After` seconds.";
     MemoryFull = "memory-full", SERVICE_UNAVAILABLE, true, "The memory limit is reached",
-        "Requests and jobs use all memory reserved for them, or indexes of tilesets all disk space: `limit` bytes, of which `actual` are in use. Retry after `Retry-After` seconds.";
+        "Requests and jobs use all memory reserved for them, or indexes of tilesets and archives of batches all disk space: `limit` bytes, of which `actual` are in use. Retry after `Retry-After` seconds.";
     StoreFull = "store-full", SERVICE_UNAVAILABLE, true, "The store is full",
         "The store uses all space reserved for it (`limit` bytes), and no object may be removed now; without `limit`, its disk is full. Retry after `Retry-After` seconds.";
     StoreFailed = "store-failed", SERVICE_UNAVAILABLE, false, "The store is unavailable",

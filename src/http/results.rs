@@ -9,7 +9,9 @@ use axum::extract::{Path, State};
 use axum::http::header::{self, HeaderMap};
 use axum::http::{HeaderValue, Method, StatusCode};
 use axum::response::{IntoResponse, Response};
-use futures_util::TryStreamExt as _;
+use bytes::Bytes;
+use futures_util::stream::BoxStream;
+use futures_util::{StreamExt as _, TryStreamExt as _};
 use metrics::counter;
 use serde_json::Value;
 use tracing::Instrument as _;
@@ -26,7 +28,7 @@ use super::{conditional, delivery};
 use crate::formats::Format;
 use crate::jobs::{self, ContentKey, Finished, REPORT};
 use crate::pipeline::Report;
-use crate::store::Namespace;
+use crate::store::{ByteStream, Namespace, StoreError};
 use crate::telemetry::{RESULTS_NOT_STORED, SpanKind, SpanParent, TraceSpan};
 
 /// Caching of results, whose bytes follow from their key.
@@ -152,17 +154,35 @@ pub(super) async fn stored(
         body = part;
     }
     let share = app.delivery_shares.take(caller.client.0)?;
-    // Pieces of running responses are charged regardless of the limit. While it is exceeded, new responses are
-    // rejected.
+    // The share is held until the body is dropped.
+    let charged = charged(app, caller, body).inspect_ok(move |_| _ = &share);
+    Ok(Some((status, out, Body::from_stream(charged)).into_response()))
+}
+
+/// Returns the size of a stored result in bytes, and its pieces, which are charged to the memory of a client; `None` if
+/// it is not stored.
+pub(super) async fn read(
+    app: &App,
+    caller: &Caller,
+    key: &ContentKey,
+    format: Format,
+) -> Result<Option<(u64, BoxStream<'static, Result<Bytes, StoreError>>)>, Problem> {
+    if !jobs::is_stored(&app.store, format, key).await? {
+        return Ok(None);
+    }
+    let Some((meta, body)) = app.store.read(&key.name(format.name())?, None).await? else { return Ok(None) };
+    Ok(Some((meta.size, charged(app, caller, body))))
+}
+
+/// Charges pieces of running responses regardless of the limit. While it is exceeded, new responses are rejected.
+fn charged(app: &App, caller: &Caller, body: ByteStream) -> BoxStream<'static, Result<Bytes, StoreError>> {
     let budget = app.memory(caller.client);
-    let charged = body.map_ok(move |piece| {
-        // The share is held until the body is dropped.
-        _ = &share;
+    let charge = move |piece: Bytes| {
         let reservation = budget.reservation();
         reservation.force(piece.len() as u64);
         reservation.attach(piece)
-    });
-    Ok(Some((status, out, Body::from_stream(charged)).into_response()))
+    };
+    body.map_ok(charge).boxed()
 }
 
 /// Returns the headers of a result, from its report.

@@ -122,7 +122,8 @@ impl Server {
         let traces = Traces::start(&config.telemetry)?;
         let budget = accept::budget(config.limits.memory_bytes, config.server.client_share);
         let scratch_bytes = config.limits.scratch_bytes;
-        let scratch = (scratch_bytes > 0).then(|| ScratchSpace::new(&config.server.data_dir, scratch_bytes));
+        let scratch = (scratch_bytes > 0)
+            .then(|| ScratchSpace::new(&config.server.data_dir, scratch_bytes, config.server.client_share));
         let settings = Settings {
             workers: config.jobs.workers.max(JOBS_PER_DEVICE * backend.devices().len()),
             queue: config.jobs.queue,

@@ -3,6 +3,8 @@
 use axum::extract::Query;
 use axum::http::{Method, Uri};
 
+use super::batch_plan::BatchPlan;
+use super::batch_state::Page;
 use super::jobs::{MAX_WAIT_S, Poll};
 use super::operations::{Operation, Parameters, TABLE};
 use super::parsed_request::parse_address;
@@ -58,10 +60,13 @@ fn check_parameters(row: &Operation, file: Option<&str>, uri: &Uri) -> Result<()
         Parameters::Areas => params::areas::parse(&pairs).map(drop).map_err(|error| error.to_string()),
         Parameters::Colors => color_parameters::parse(&pairs).map(drop).map_err(|error| error.to_string()),
         Parameters::Tileset => Err("a signature is valid for one URL, and a tileset has many; use a key".to_owned()),
+        Parameters::Jobs => Err("a signature is valid for one URL, and a list has many pages; use a key".to_owned()),
         Parameters::Wait => {
             let Query(poll) = Query::<Poll>::try_from_uri(uri).map_err(|error| error.body_text())?;
             if poll.wait() <= MAX_WAIT_S { Ok(()) } else { Err(format!("`wait` is more than {MAX_WAIT_S} s")) }
         }
+        Parameters::Batch => BatchPlan::parse(&pairs).map(drop).map_err(|error| error.to_string()),
+        Parameters::Page => Page::parse(&pairs).map(drop).map_err(|error| error.to_string()),
         Parameters::None => match pairs.first() {
             Some((name, _)) => Err(format!("unknown parameter `{name}`; this path has none")),
             None => Ok(()),
@@ -84,6 +89,8 @@ mod tests {
             "/v1/jobs/7?wait=20",
             "/v1/jobs/7/events",
             "/v1/jobs/7/result",
+            "/v1/batches/7?offset=100&limit=50",
+            "/v1/batches/7/results.tar",
             &format!("/v1/structures/{digest}/surface.stl"),
             &format!("/v1/structures/{digest}/atoms"),
             &format!("/v1/results/{digest}.glb"),
@@ -106,7 +113,9 @@ mod tests {
             ("/v1/pdb/4pti/surface.glb?format=glb", "already names glb"),
             ("/v1/pdb/4pti/surface.glb?width=100", "`width`"),
             ("/v1/pdb/4pti/tileset.json", "a tileset has many"),
+            ("/v1/jobs?limit=10", "a list has many pages"),
             ("/v1/jobs/7?wait=99", "more than 55"),
+            ("/v1/batches/7?limit=1001", "from 1 to 1000"),
             ("/v1/jobs/7?wiat=9", "unknown field `wiat`"),
             ("/v1/jobs/7/result?wait=9", "`wait`; this path has none"),
         ] {

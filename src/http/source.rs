@@ -190,6 +190,11 @@ impl FromRequestParts<Shared> for DocumentRequest {
 }
 
 impl DocumentRequest {
+    /// Creates the request for a document of the structure in a body. It has no conditions.
+    pub(super) fn from_body(app: Shared, caller: Caller, source: StructureSource) -> Self {
+        Self { app, caller, headers: HeaderMap::new(), source }
+    }
+
     /// Returns a response with the document that `write` makes of the structure, or 304 if the client has it. `write`
     /// holds the delivery slot of the request until its work has stopped. `options` are those of
     /// [`StructureSource::find`]. The `ETag` is that of [`etag`] with `variant`, the parameters of the document.

@@ -11,6 +11,7 @@ use axum::http::header;
 use axum::http::request::Parts;
 use axum::response::{IntoResponse, Response};
 
+use super::openapi::bodies::SubtreeFile;
 use super::openapi::meshes::NotModified;
 use super::openapi::parameters::{ConditionHeaders, StructurePath, SubtreeParameters, TilesetParameters};
 use super::openapi::problem_responses;
@@ -52,7 +53,7 @@ pub(super) async fn show(request: TilesetRequest) -> Result<Response, Problem> {
 #[utoipa::path(get, path = "/v1/structures/{digest}/tileset.subtree", tag = "tilesets", operation_id = "showSubtree",
     params(StructurePath, SubtreeParameters, ConditionHeaders),
     responses(
-        (status = 200, description = "The subtree.", body = Vec<u8>, content_type = "application/octet-stream", headers(("ETag"), ("Cache-Control"))),
+        (status = 200, description = "The subtree.", body = inline(SubtreeFile), content_type = "application/octet-stream", headers(("ETag"), ("Cache-Control"))),
         NotModified, Problems,
     ))]
 pub(super) async fn show_subtree(request: TilesetRequest) -> Result<Response, Problem> {

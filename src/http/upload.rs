@@ -1,5 +1,6 @@
 //! Request bodies: raw bytes, multipart forms or JSON, checked against the limits while they arrive.
 
+use std::io;
 use std::time::Duration;
 
 use axum::body::Body;
@@ -7,6 +8,8 @@ use axum::http::HeaderMap;
 use axum::http::header::{CONTENT_ENCODING, CONTENT_LENGTH, CONTENT_TYPE};
 use bytes::{Bytes, BytesMut};
 use futures_util::StreamExt as _;
+use tokio::fs::File;
+use tokio::io::AsyncWriteExt as _;
 
 use super::body_hasher::BodyHasher;
 use super::content_type::DeclaredType;
@@ -18,7 +21,8 @@ use super::state::App;
 use crate::jobs::MemoryReservation;
 use crate::pipeline::JobError;
 use crate::store::Digest;
-use crate::structure::{GZIP_MAGIC, SourceFormat, ZSTD_MAGIC, detect_format};
+use crate::structure::stream::ScratchFile;
+use crate::structure::{GZIP_MAGIC, SourceFormat, StructureError, ZSTD_MAGIC, detect_format};
 use crate::surface::{Exceeded, Limit, MemoryMeter as _};
 
 /// Maximum size of a JSON body, bytes. A document names a structure and about thirty parameters.
@@ -112,6 +116,45 @@ pub(super) async fn receive_json(
     let (bytes, _digest) = received.map_err(|problem| problem.advise(NOT_JSON))?;
     // The document is charged until it has been parsed.
     Ok(reservation.attach(bytes))
+}
+
+/// Receives the archive of a batch into a temporary file.
+pub(super) async fn spool(app: &App, caller: &Caller, headers: &HeaderMap, body: Body) -> Result<ScratchFile, Problem> {
+    if is_multipart(headers) {
+        let detail = "an archive must be the whole body, not a part of a form";
+        return Err(Problem::new(ProblemType::UnsupportedMediaType, detail));
+    }
+    if let Some((name, _)) = content_encoding(headers)?.filter(|(_, magic)| *magic != GZIP_MAGIC) {
+        return Err(bad_encoding(&format!("an archive cannot be compressed with {name}")));
+    }
+    let limit = Exceeded::new(Limit::BodyBytes, app.config.limits.body_bytes);
+    let announced = announced(headers, &limit)?;
+    let ScratchFile { file, meter } = app.structures().scratch_file(caller.client)?;
+    // Rejected before the body arrives.
+    meter.check(announced).map_err(StructureError::DiskSpace)?;
+    let receive = async {
+        let (mut stream, mut file, mut length) = (body.into_data_stream(), File::from_std(file), 0);
+        while let Some(data) = stream.next().await {
+            let data = data.map_err(|e| broken(&e))?;
+            length += data.len() as u64;
+            if length > limit.max {
+                return Err(Problem::from(&limit));
+            }
+            meter.grow(data.len() as u64).map_err(StructureError::DiskSpace)?;
+            file.write_all(&data).await.map_err(|e| not_written(&e))?;
+        }
+        file.flush().await.map_err(|e| not_written(&e))?;
+        Ok(file.into_std().await)
+    };
+    let file = in_time(app, receive).await?;
+    Ok(ScratchFile { file, meter })
+}
+
+fn not_written(error: &io::Error) -> Problem {
+    match error.kind() {
+        io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded => StructureError::DiskFull.into(),
+        _ => Problem::internal(format!("the archive of a batch cannot be written: {error}")),
+    }
 }
 
 /// Returns the length that the headers announce, 0 if they do not.

@@ -10,6 +10,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use bytes::Bytes;
+use quick_cache::sync::Cache;
 use serde_json::Value;
 use tokio::sync::{Semaphore, watch};
 use tracing::Instrument as _;
@@ -17,6 +18,8 @@ use tracing::Instrument as _;
 use super::broker::{Broker, Dispatch};
 use super::durable_job::DurableJob;
 use super::job_map::JobMap;
+use super::listing;
+use super::rank::Client;
 use super::record::{JobId, JobRecord, Requester, Status, now_ms};
 use super::records::existing;
 use super::runner::Runner;
@@ -33,6 +36,8 @@ use crate::sync::{Handle, timeout};
 const STORED_WAIT: Duration = Duration::from_secs(5);
 /// Number of records of begun and ended jobs that are written concurrently, so that others find a free thread.
 const CONCURRENT_WRITES: usize = 64;
+/// Number of ended jobs of batches whose states are kept: about 2 MB, for several large batches.
+const KNOWN_ENDS: usize = 20_000;
 
 /// Request for a durable job.
 #[derive(Debug)]
@@ -49,6 +54,8 @@ pub(crate) struct JobSpec {
     pub(crate) format: Format,
     /// Idempotency key of the request.
     pub(crate) idempotency_key: Option<String>,
+    /// Batch of the job.
+    pub(crate) batch: Option<JobId>,
 }
 
 /// State of a job that its watchers see.
@@ -83,9 +90,15 @@ pub(super) struct JobStoreState {
     pub(super) output_bytes: u64,
     pub(super) describe: DescribeError,
     /// Secret that derives job ids from idempotency keys.
-    secret: Secret,
+    pub(super) secret: Secret,
+    /// Final states of jobs of batches, so that the state of a batch reads each record once.
+    pub(super) ends: Cache<JobId, Status>,
     /// Jobs that this process knows of.
     jobs: Mutex<JobMap>,
+    /// Namespaces of jobs that were listed.
+    pub(super) namespaces: Cache<JobId, Namespace>,
+    /// Permits to read a record for a list or a batch.
+    pub(super) record_reads: Semaphore,
     /// True once the records of earlier processes were read.
     pub(super) records_read: watch::Sender<bool>,
     /// Permits to write the record of a begun or ended job.
@@ -107,6 +120,11 @@ impl JobStoreState {
     /// Returns the time for which a rejected write is retried.
     pub(super) fn retry_time(&self) -> Duration {
         Duration::from_millis(self.config.save_retry_ms)
+    }
+
+    /// Returns the last digits of the ids of the jobs of a client.
+    pub(super) fn owner_digits(&self, client: Client) -> String {
+        JobId::owner_digits(&self.secret, client.0)
     }
 
     pub(super) fn lock(&self) -> MutexGuard<'_, JobMap> {
@@ -135,7 +153,10 @@ impl JobStore {
             output_bytes,
             describe,
             secret,
+            ends: Cache::new(KNOWN_ENDS),
             jobs: Mutex::default(),
+            namespaces: Cache::new(listing::MAX_NAMESPACES),
+            record_reads: Semaphore::new(listing::CONCURRENT_READS),
             records_read: watch::Sender::new(false),
             writes: Semaphore::new(CONCURRENT_WRITES),
             slots,
@@ -161,6 +182,7 @@ impl JobStore {
             parameters: spec.parameters,
             format: spec.format.name().to_owned(),
             client,
+            batch: spec.batch,
             urgency: spec.task.rank.urgency,
             suits_gpu: suits_gpu(spec.task.input.atoms(), &spec.task.options),
             status: Status::Accepted,
@@ -242,7 +264,12 @@ impl JobStore {
 
     /// Calls `use_job` with a job in memory, if it is of the namespace, under the lock of the map. A job that is
     /// subscribed to there stays in memory.
-    fn known<T>(&self, id: &JobId, namespace: Namespace, use_job: impl FnOnce(&Arc<DurableJob>) -> T) -> Option<T> {
+    pub(super) fn known<T>(
+        &self,
+        id: &JobId,
+        namespace: Namespace,
+        use_job: impl FnOnce(&Arc<DurableJob>) -> T,
+    ) -> Option<T> {
         self.0.lock().jobs.get(id).filter(|job| job.state.borrow().record.namespace == namespace).map(use_job)
     }
 

@@ -5,8 +5,9 @@
 //! graphics API.
 //!
 //! `queue` holds `coalesced_job`s: identical requests share one. `job_store` keeps `durable_job`s, whose `records`
-//! survive the process.
+//! survive the process. A `batch` is a list of durable jobs.
 
+mod batch;
 mod broker;
 mod claims;
 mod coalesced_job;
@@ -21,6 +22,7 @@ mod job_map;
 mod job_store;
 mod kept;
 mod key;
+mod listing;
 mod pool;
 mod queue;
 mod rank;
@@ -39,6 +41,7 @@ mod ticket;
 mod worker;
 
 pub(crate) use crate::memory_budget::{Budget, MemoryReservation};
+pub(crate) use batch::{BatchFile, BatchRecord, MAX_RECORD_BYTES, Room};
 pub use broker::check_broker;
 pub(crate) use broker::{Broker, MemoryBroker, NatsBroker};
 pub(crate) use coalesced_job::OnStart;
@@ -46,9 +49,10 @@ pub(crate) use error::{AcceptError, EndError, Failure, Refusal};
 pub(crate) use job_store::{JobSpec, JobStore, JobView};
 pub(crate) use kept::{CacheKey, Input, SharedStructure, SharedTileset};
 pub(crate) use key::ContentKey;
+pub(crate) use listing::{JobCursor, JobFilter, LISTED_BYTES, MAX_READS};
 pub(crate) use pool::{Pool, Settings};
 pub(crate) use rank::{Client, DEFAULT_URGENCY, Lane, Rank};
-pub(crate) use record::{JobId, JobRecord, Status, rfc3339};
+pub(crate) use record::{JobId, JobRecord, Status, now_ms, rfc3339};
 pub(crate) use results::{REPORT, SaveError, document, is_stored, save};
 pub(crate) use scratch::ScratchSpace;
 pub(crate) use structures::Structures;

@@ -5,6 +5,7 @@ use std::str::FromStr;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use bytes::Bytes;
+use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 use thiserror::Error;
@@ -22,6 +23,11 @@ pub(crate) struct BadJobId;
 /// Digits of a job id.
 const DIGITS: usize = 32;
 
+/// Writes bytes as hexadecimal digits, an even number of them.
+fn hex(bytes: &[u8; 32], digits: usize) -> String {
+    bytes.iter().map(|byte| format!("{byte:02x}")).take(digits / 2).collect()
+}
+
 /// Id of a job. It is a secret: every client of its namespace that knows it can see and cancel the job.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(try_from = "String")]
@@ -38,11 +44,12 @@ impl JobId {
     /// Returns the first digits of `unique` and the number of `client`, so that the store counts the jobs of each
     /// client without reading their records. The number is an HMAC: it does not reveal the client.
     fn new(unique: &[u8; 32], secret: &Secret, client: u64) -> Self {
-        let hex = |bytes: &[u8; 32], digits: usize| -> String {
-            bytes.iter().map(|byte| format!("{byte:02x}")).take(digits / 2).collect()
-        };
-        let owner = hex(&derive(secret, &format!("client\n{client:x}")), OWNER_DIGITS);
-        Self(hex(unique, DIGITS - OWNER_DIGITS) + &owner)
+        Self(hex(unique, DIGITS - OWNER_DIGITS) + &Self::owner_digits(secret, client))
+    }
+
+    /// Returns the last digits of the ids of the jobs of `client`. Clients may share them.
+    pub(super) fn owner_digits(secret: &Secret, client: u64) -> String {
+        hex(&derive(secret, &format!("client\n{client:x}")), OWNER_DIGITS)
     }
 
     /// Returns the id for an idempotency key: the same for the same key of the same client in a namespace, even after a
@@ -100,6 +107,9 @@ pub(crate) enum Status {
 }
 
 impl Status {
+    /// All statuses.
+    pub(crate) const ALL: [Self; 5] = [Self::Accepted, Self::Running, Self::Successful, Self::Failed, Self::Dismissed];
+
     /// Returns the name of the status.
     pub(crate) const fn name(self) -> &'static str {
         match self {
@@ -138,6 +148,9 @@ pub(crate) struct JobRecord {
     pub(crate) format: String,
     /// Number of the client, for its shares and quotas after a restart.
     pub(crate) client: u64,
+    /// Batch of the job, whose record is kept until the job has ended.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub(crate) batch: Option<JobId>,
     /// Urgency from 0 (first) to 7 (last).
     pub(crate) urgency: u8,
     /// True for a job that workers with a GPU should run.
@@ -212,10 +225,10 @@ const CHECKSUM_FIELD: &[u8] = b",\"sha256\":\"";
 
 /// Record with the version of its format.
 #[derive(Debug, Serialize)]
-struct Versioned<'a> {
+struct Versioned<'a, T> {
     version: u64,
     #[serde(flatten)]
-    content: &'a JobRecord,
+    content: &'a T,
 }
 
 /// Divides a record into the bytes before the checksum, and the checksum; `None` for a record without one.
@@ -236,39 +249,44 @@ pub(super) enum BadRecord {
     OtherRelease(String),
 }
 
+/// Returns the document to store of the record of a job or a batch.
+pub(super) fn encode<T: Serialize>(content: &T) -> Bytes {
+    let mut text = serde_json::to_vec(&Versioned { version: VERSION, content }).unwrap_or_default();
+    // The brace follows the checksum.
+    text.pop();
+    let checksum = Digest::of(&text);
+    text.extend_from_slice(CHECKSUM_FIELD);
+    text.extend_from_slice(format!("{checksum}\"}}").as_bytes());
+    Bytes::from(text)
+}
+
+/// Parses a stored document. A checksum that matches distinguishes a record of another release from a damaged one.
+pub(super) fn decode<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, BadRecord> {
+    let checked = split_checksum(bytes);
+    if let Some((content, checksum)) = checked
+        && Digest::of(content) != checksum
+    {
+        return Err(BadRecord::Damaged("its checksum does not match".to_owned()));
+    }
+    let mut fields: Map<String, Value> =
+        serde_json::from_slice(bytes).map_err(|error| BadRecord::Damaged(error.to_string()))?;
+    let version = fields.remove("version").unwrap_or(VERSION.into());
+    if version != VERSION {
+        return Err(BadRecord::OtherRelease(format!("it has version {version}, expected {VERSION}")));
+    }
+    if checked.is_some() {
+        fields.remove(CHECKSUM);
+    }
+    serde_json::from_value(fields.into()).map_err(|error| match checked {
+        Some(_) => BadRecord::OtherRelease(error.to_string()),
+        None => BadRecord::Damaged(error.to_string()),
+    })
+}
+
 impl JobRecord {
     /// Returns the document to store.
     pub(super) fn to_bytes(&self) -> Bytes {
-        let mut text = serde_json::to_vec(&Versioned { version: VERSION, content: self }).unwrap_or_default();
-        // The brace follows the checksum.
-        text.pop();
-        let checksum = Digest::of(&text);
-        text.extend_from_slice(CHECKSUM_FIELD);
-        text.extend_from_slice(format!("{checksum}\"}}").as_bytes());
-        Bytes::from(text)
-    }
-
-    /// Parses a stored document. A checksum that matches distinguishes a record of another release from a damaged one.
-    pub(super) fn from_bytes(bytes: &[u8]) -> Result<Self, BadRecord> {
-        let checked = split_checksum(bytes);
-        if let Some((content, checksum)) = checked
-            && Digest::of(content) != checksum
-        {
-            return Err(BadRecord::Damaged("its checksum does not match".to_owned()));
-        }
-        let mut fields: Map<String, Value> =
-            serde_json::from_slice(bytes).map_err(|error| BadRecord::Damaged(error.to_string()))?;
-        let version = fields.remove("version").unwrap_or(VERSION.into());
-        if version != VERSION {
-            return Err(BadRecord::OtherRelease(format!("it has version {version}, expected {VERSION}")));
-        }
-        if checked.is_some() {
-            fields.remove(CHECKSUM);
-        }
-        serde_json::from_value(fields.into()).map_err(|error| match checked {
-            Some(_) => BadRecord::OtherRelease(error.to_string()),
-            None => BadRecord::Damaged(error.to_string()),
-        })
+        encode(self)
     }
 
     /// Parses the stored parameters and the format.
@@ -341,6 +359,7 @@ mod tests {
             parameters: parameters.iter().map(|(n, v)| ((*n).to_owned(), (*v).to_owned())).collect(),
             format: "glb".to_owned(),
             client: u64::MAX,
+            batch: None,
             urgency: 3,
             suits_gpu: false,
             status: Status::Accepted,
@@ -377,15 +396,15 @@ mod tests {
     fn records_survive_a_round_trip() {
         let record = record(&[("resolution", "0.5")]);
         let text = record.to_bytes().to_vec();
-        assert_eq!(JobRecord::from_bytes(&text).unwrap(), record);
+        assert_eq!(decode::<JobRecord>(&text).unwrap(), record);
         // Records of earlier versions have no requester.
         let mut old = serde_json::to_value(&record).unwrap();
         old.as_object_mut().unwrap().remove("requester").unwrap();
         assert_eq!(serde_json::from_value::<JobRecord>(old).unwrap().requester, Requester::default());
         let old = serde_json::to_vec(&record).unwrap();
-        assert_eq!(JobRecord::from_bytes(&old).unwrap(), record, "the first records have neither version nor checksum");
+        assert_eq!(decode::<JobRecord>(&old).unwrap(), record, "the first records have neither version nor checksum");
         let hostile = String::from_utf8(old).unwrap().replace(record.id.as_str(), "../../x");
-        assert!(matches!(JobRecord::from_bytes(hostile.as_bytes()), Err(BadRecord::Damaged(_))));
+        assert!(matches!(decode::<JobRecord>(hostile.as_bytes()), Err(BadRecord::Damaged(_))));
     }
 
     /// Returns a record with this field, and a checksum that matches.
@@ -412,20 +431,20 @@ mod tests {
             br#"{"version":2,"id":7}"#.to_vec(),
         ];
         for bytes in later {
-            let found = JobRecord::from_bytes(&bytes);
+            let found = decode::<JobRecord>(&bytes);
             assert!(matches!(found, Err(BadRecord::OtherRelease(_))), "{found:?}");
         }
         let text = record.to_bytes();
         for damaged in [b"".as_slice(), b"[]", br#"{"version":1}"#, b"{\"later\":1}"] {
-            assert!(matches!(JobRecord::from_bytes(damaged), Err(BadRecord::Damaged(_))), "{damaged:?}");
+            assert!(matches!(decode::<JobRecord>(damaged), Err(BadRecord::Damaged(_))), "{damaged:?}");
         }
         for length in 0..text.len() {
-            assert!(matches!(JobRecord::from_bytes(&text[..length]), Err(BadRecord::Damaged(_))), "{length}");
+            assert!(matches!(decode::<JobRecord>(&text[..length]), Err(BadRecord::Damaged(_))), "{length}");
         }
         for bit in 0..8 * text.len() {
             let mut flipped = text.to_vec();
             flipped[bit / 8] ^= 1 << (bit % 8);
-            assert!(matches!(JobRecord::from_bytes(&flipped), Err(BadRecord::Damaged(_))), "bit {bit}");
+            assert!(matches!(decode::<JobRecord>(&flipped), Err(BadRecord::Damaged(_))), "bit {bit}");
         }
     }
 

@@ -12,12 +12,13 @@ use std::time::Duration;
 use bytes::Bytes;
 use futures_util::{StreamExt as _, stream};
 use metrics::counter;
+use serde::de::DeserializeOwned;
 
 use super::broker::{Dispatch, JobEvent};
 use super::durable_job::DurableJob;
 use super::job_store::{JobStore, JobStoreState};
 use super::rank::{Client, Rank};
-use super::record::{BadRecord, JobId, JobRecord};
+use super::record::{BadRecord, JobId, JobRecord, decode};
 use super::retry::retry;
 use super::{AcceptError, Input, JobView, Task};
 use crate::formats::Format;
@@ -29,11 +30,12 @@ use crate::telemetry::{JOBS_RECOVERED, shorten};
 const CONCURRENT_READS: usize = 64;
 
 impl JobStoreState {
-    /// Protects the inputs (structure and map) and the record of an unfinished job from eviction.
+    /// Protects the inputs (structure and map), the record and the batch of an unfinished job from eviction.
     pub(super) fn pins(&self, record: &JobRecord) -> Vec<Pin> {
         let inputs = [record.input].into_iter().chain(record.map);
         let inputs = inputs.map(|input| Name::input(&input).within(record.namespace));
-        Name::job(record.id.as_str()).into_iter().chain(inputs).map(|name| self.store.pin(&name)).collect()
+        let batch = record.batch.iter().filter_map(|batch| Name::batch(batch.as_str()).ok());
+        Name::job(record.id.as_str()).into_iter().chain(batch).chain(inputs).map(|name| self.store.pin(&name)).collect()
     }
 
     /// Adds an unfinished job; see [`JobMap::open`](super::job_map::JobMap::open). An error in `dispatch` is the reason
@@ -56,6 +58,7 @@ impl JobStoreState {
         let (reservation, removed) = self.store.admit_record(&Name::job(id.as_str())?, &self.config).await?;
         for id in removed.iter().filter_map(|name| name.stem().parse().ok()) {
             self.lock().jobs.remove(&id);
+            self.ends.remove(&id);
         }
         Ok(reservation)
     }
@@ -120,9 +123,28 @@ impl JobStoreState {
         if ended.is_some() { Ok(ended) } else { open }
     }
 
-    /// Reads a document. A damaged one goes into quarantine.
-    async fn read_document(&self, name: &Name) -> Result<Option<JobRecord>, StoreError> {
-        match self.store.get(name).await?.map(|stored| JobRecord::from_bytes(&stored.bytes)) {
+    /// Reads the record of a job that was listed as open or ended. Does not count as a use.
+    pub(super) async fn peek(&self, id: &JobId, is_ended: bool) -> Result<Option<JobRecord>, StoreError> {
+        let (open, ended) = (Name::job(id.as_str())?, Name::ended_job(id.as_str())?);
+        if !is_ended && let Some(record) = self.parse_document(&open, self.store.peek(&open).await?).await? {
+            return Ok(Some(record));
+        }
+        self.parse_document(&ended, self.store.peek(&ended).await?).await
+    }
+
+    /// Reads the document of a job or a batch.
+    pub(super) async fn read_document<T: DeserializeOwned>(&self, name: &Name) -> Result<Option<T>, StoreError> {
+        let stored = self.store.get(name).await?;
+        self.parse_document(name, stored.map(|stored| stored.bytes)).await
+    }
+
+    /// Parses a document that was read. A damaged one goes into quarantine.
+    async fn parse_document<T: DeserializeOwned>(
+        &self,
+        name: &Name,
+        bytes: Option<Bytes>,
+    ) -> Result<Option<T>, StoreError> {
+        match bytes.map(|bytes| decode(&bytes)) {
             Some(Ok(record)) => return Ok(Some(record)),
             Some(Err(BadRecord::OtherRelease(why))) => return Err(StoreError::OtherRelease { why }),
             Some(Err(error @ BadRecord::Damaged(_))) => {
@@ -185,7 +207,7 @@ impl JobStore {
     /// process, and returns their number. After the error of a single record, the others were handled.
     pub(crate) async fn reconcile(&self) -> Result<usize, StoreError> {
         let inner = &self.0;
-        let read = |name: Name| async move { (inner.read_document(&name).await, name) };
+        let read = |name: Name| async move { (inner.read_document::<JobRecord>(&name).await, name) };
         let mut reads = stream::iter(inner.unknown_records().await?).map(read).buffer_unordered(CONCURRENT_READS);
         let (mut records, mut error) = (Vec::new(), None);
         while let Some((read, name)) = reads.next().await {

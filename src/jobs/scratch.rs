@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, OnceLock, Weak};
 
-use super::Structures;
+use super::{Client, Structures};
 use crate::memory_budget::{Budget, Reclaim};
 use crate::structure::StructureError;
 use crate::structure::stream::ScratchFile;
@@ -18,9 +18,10 @@ pub(crate) struct ScratchSpace {
 }
 
 impl ScratchSpace {
-    /// Allows temporary files of together `limit` bytes in a folder.
-    pub(crate) fn new(folder: &Path, limit: u64) -> Arc<Self> {
-        let (folder, budget, cache) = (folder.to_owned(), Budget::of_disk(limit), OnceLock::new());
+    /// Allows temporary files of together `limit` bytes in a folder. A client whose files take more than the fraction
+    /// `share` leaves as much to others.
+    pub(crate) fn new(folder: &Path, limit: u64, share: f64) -> Arc<Self> {
+        let (folder, budget, cache) = (folder.to_owned(), Budget::of_disk(limit, share), OnceLock::new());
         let space = Arc::new(Self { folder, budget, cache });
         let owner: Arc<dyn Reclaim> = Arc::<Self>::clone(&space);
         space.budget.reclaim_from(Arc::downgrade(&owner));
@@ -43,9 +44,21 @@ impl ScratchSpace {
     /// # Errors
     /// Returns [`StructureError::Scratch`].
     pub(super) fn file(&self) -> Result<ScratchFile, StructureError> {
+        self.charged_file(&self.budget)
+    }
+
+    /// Creates a file that counts towards the share of a client.
+    ///
+    /// # Errors
+    /// Returns [`StructureError::Scratch`].
+    pub(super) fn client_file(&self, client: Client) -> Result<ScratchFile, StructureError> {
+        self.charged_file(&self.budget.for_client(client.0))
+    }
+
+    fn charged_file(&self, budget: &Budget) -> Result<ScratchFile, StructureError> {
         let file = tempfile::tempfile_in(&self.folder);
         let file = file.map_err(|error| StructureError::Scratch { reason: error.to_string() })?;
-        Ok(ScratchFile { file, meter: Arc::new(self.budget.reservation()) })
+        Ok(ScratchFile { file, meter: Arc::new(budget.reservation()) })
     }
 }
 

@@ -11,12 +11,13 @@ use metrics::{counter, gauge};
 use super::kept::{
     CacheKey, CacheState, Charged, Input, Kept, Shared, SharedColors, SharedStructure, SharedTileset, tileset_digests,
 };
+use super::rank::Client;
 use super::{MemoryReservation, ScratchSpace};
 use crate::memory_budget::{Budget, Reclaim};
 use crate::pipeline::tileset::{self, StreamSource, StructureStream, Tileset};
 use crate::pipeline::{JobError, Options, StageClock};
 use crate::store::Digest;
-use crate::structure::stream::BLOCK_BYTES;
+use crate::structure::stream::{BLOCK_BYTES, ScratchFile};
 use crate::structure::{self, ReadLimits, StructureError};
 use crate::surface::{CancelToken, Control, Exceeded, Limit, MemoryMeter as _, OutOfMemory, Reservation, SurfaceError};
 use crate::sync::{Condvar, Mutex, MutexGuard};
@@ -58,6 +59,15 @@ impl Structures {
         let owner: Arc<dyn Reclaim> = Arc::<Self>::clone(&structures);
         budget.reclaim_from(Arc::downgrade(&owner));
         structures
+    }
+
+    /// Creates a temporary file of a client, whose size counts towards the disk space for tilesets.
+    ///
+    /// # Errors
+    /// Returns [`StructureError::DiskSpace`] if there is no such space, and [`StructureError::Scratch`].
+    pub(crate) fn scratch_file(&self, client: Client) -> Result<ScratchFile, StructureError> {
+        let none = || StructureError::DiskSpace(OutOfMemory::Limit { needed: 1, limit: 0 });
+        self.scratch.as_ref().ok_or_else(none)?.client_file(client)
     }
 
     /// Finds a file in the cache. If `options` have a tile, its tileset comes first: returns the tileset itself if its
@@ -518,7 +528,7 @@ mod tests {
     #[test]
     fn concurrent_requests_for_a_tileset_on_disk_index_it_once() {
         let folder = tempfile::tempdir().unwrap();
-        let (budget, scratch) = (Budget::unlimited(), ScratchSpace::new(folder.path(), 1 << 30));
+        let (budget, scratch) = (Budget::unlimited(), ScratchSpace::new(folder.path(), 1 << 30, 1.0));
         let space = scratch.budget().clone();
         let structures = Structures::new(1 << 20, &budget, Some(scratch));
         let (input, digest) = file(20_000);

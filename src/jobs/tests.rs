@@ -61,8 +61,7 @@ impl Fixture {
         let pool = Arc::new(Pool::start(settings, Arc::new(ReferenceBackend), "a test".to_owned()).unwrap());
         let describe = |error: &EndError| Value::String(format!("{error:?}"));
         let broker = MemoryBroker::new(1000);
-        let shared = Arc::new(broker.clone());
-        let jobs = JobStore::new(store.clone(), pool, shared, config, 1 << 30, [0; 32], describe);
+        let jobs = JobStore::new(store.clone(), pool, Arc::new(broker.clone()), config, 1 << 30, [0; 32], describe);
         jobs.start_claiming();
         Self { faults, store, jobs, broker, dir }
     }
@@ -78,9 +77,9 @@ impl Fixture {
     }
 
     async fn accept_from(&self, client: &str) -> Result<JobView, AcceptError> {
-        let parameters = vec![("resolution".to_owned(), "2".to_owned())];
-        let (task, file) = (task(client, "2"), Bytes::from_static(SAMPLE));
-        let spec = JobSpec { task, file, map: None, parameters, format: Format::Stl, idempotency_key: None };
+        let (task, parameters) = (task(client, "2"), vec![("resolution".to_owned(), "2".to_owned())]);
+        let (file, format) = (Bytes::from_static(SAMPLE), Format::Stl);
+        let spec = JobSpec { task, file, map: None, parameters, format, idempotency_key: None, batch: None };
         self.jobs.accept(spec, None).await
     }
 
@@ -100,6 +99,7 @@ impl Fixture {
             parameters: vec![("resolution".to_owned(), "2".to_owned())],
             format: "stl".to_owned(),
             client: 1,
+            batch: None,
             urgency: DEFAULT_URGENCY,
             suits_gpu: false,
             status: Status::Accepted,

@@ -1,6 +1,7 @@
 //! In-memory index of objects: sizes, times of last use, pins and reservations. Never blocks or accesses a disk.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::ops::Bound;
 use std::time::{Duration, SystemTime};
 
 use metrics::gauge;
@@ -128,14 +129,20 @@ impl Index {
     fn reorder(&mut self, name: &Name, old: Option<Use>, new: Option<Use>) {
         old.and_then(|old| self.by_use.remove(&old));
         new.and_then(|new| self.by_use.insert(new, name.clone()));
-        if name.is_ended_job() {
+        if name.is_ended_job() || name.is_batch() {
             self.records.reorder(name, old, new);
         }
     }
 
     /// Returns the names of the objects of a folder.
     pub(super) fn names(&self, folder: Folder) -> Vec<Name> {
-        self.entries.keys().filter(|name| name.folder() == folder).cloned().collect()
+        self.names_after(&Name::before(folder), usize::MAX)
+    }
+
+    /// Returns the names of at most `n` objects of the folder of `name` that follow it.
+    pub(super) fn names_after(&self, name: &Name, n: usize) -> Vec<Name> {
+        let later = self.entries.range((Bound::Excluded(name), Bound::Unbounded)).map(|(name, _)| name);
+        later.take_while(|other| other.folder() == name.folder()).take(n).cloned().collect()
     }
 
     /// Counts the record of a new job, unless a cap is reached.

@@ -18,7 +18,7 @@ pub struct BadName(&'static str);
 pub enum Folder {
     /// Uploaded structure files, by digest.
     Inputs,
-    /// Job records, by job id. The records of ended jobs have names of their own.
+    /// Records of jobs and batches, by id. The records of ended jobs have names of their own.
     Jobs,
     /// Mesh files and reports, by content key.
     Results,
@@ -48,6 +48,8 @@ impl Folder {
 const OPEN: &str = ".json";
 /// End of the file name of an ended job's record.
 const ENDED: &str = ".ended.json";
+/// End of the file name of a batch's record.
+const BATCH: &str = ".batch.json";
 /// Digits of a job id that name its client.
 pub(crate) const OWNER_DIGITS: usize = 8;
 
@@ -82,6 +84,14 @@ impl Name {
         Self::job_record(id, ENDED)
     }
 
+    /// Returns the name of the record of a batch of jobs.
+    ///
+    /// # Errors
+    /// As for [`job`](Self::job).
+    pub fn batch(id: &str) -> Result<Self, BadName> {
+        Self::job_record(id, BATCH)
+    }
+
     fn job_record(id: &str, extension: &str) -> Result<Self, BadName> {
         let good = |c: u8| matches!(c, b'0'..=b'9' | b'a'..=b'f');
         if id.is_empty() || id.len() > 64 || !id.bytes().all(good) {
@@ -93,6 +103,11 @@ impl Name {
     /// Returns true for the record of an ended job.
     pub(crate) fn is_ended_job(&self) -> bool {
         self.folder == Folder::Jobs && self.file.ends_with(ENDED)
+    }
+
+    /// Returns true for the record of a batch.
+    pub(crate) fn is_batch(&self) -> bool {
+        self.folder == Folder::Jobs && self.file.ends_with(BATCH)
     }
 
     /// Returns the file name up to its first dot: the id of a job, or the key of a result.
@@ -130,6 +145,11 @@ impl Name {
         Self { folder: self.folder, file: format!("{}{rest}", namespace.stem(stem)).into() }
     }
 
+    /// Returns a name before those of all objects of a folder.
+    pub(super) fn before(folder: Folder) -> Self {
+        Self { folder, file: "".into() }
+    }
+
     /// Returns the folder.
     #[must_use]
     pub fn folder(&self) -> Folder {
@@ -151,9 +171,10 @@ impl Name {
     pub(super) fn from_file_name(folder: Folder, file: &str) -> Option<Self> {
         match folder {
             Folder::Inputs => file.parse().ok().map(|digest| Self::input(&digest)),
-            Folder::Jobs => match file.strip_suffix(ENDED) {
-                Some(id) => Self::ended_job(id).ok(),
-                None => Self::job(file.strip_suffix(OPEN)?).ok(),
+            Folder::Jobs => match (file.strip_suffix(ENDED), file.strip_suffix(BATCH)) {
+                (Some(id), _) => Self::ended_job(id).ok(),
+                (None, Some(id)) => Self::batch(id).ok(),
+                (None, None) => Self::job(file.strip_suffix(OPEN)?).ok(),
             },
             Folder::Results => file.split_once('.').and_then(|(key, extension)| Self::result(key, extension).ok()),
         }

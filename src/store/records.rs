@@ -21,7 +21,7 @@ pub(super) type Scope = Option<u32>;
 struct Jobs {
     /// Number of jobs, on record and admitted.
     count: usize,
-    /// Records of ended jobs.
+    /// Records of ended jobs, and of batches, which count as jobs.
     ended: BTreeMap<Use, Name>,
 }
 

@@ -16,7 +16,7 @@ use super::name::{Folder, Name};
 use super::object::Meta;
 use crate::config::StoreConfig;
 
-/// Number of objects that are updated in the index under one lock.
+/// Number of objects that are updated or listed in the index under one lock.
 const REFRESHED: usize = 1000;
 /// Upper limit of the steps of file times.
 const CLOCK_STEP: Duration = Duration::from_secs(2);
@@ -27,12 +27,20 @@ impl Store {
         Self::open_backend(Backend::open(config, data_dir).await?, config, is_shared).await
     }
 
-    /// Returns the names of all job records, in name order.
+    /// Returns the names of all job records, without those of batches, in name order.
     pub(crate) async fn job_records(&self) -> Result<Vec<Name>, StoreError> {
         if !self.0.is_shared {
-            return Ok(self.index().names(Folder::Jobs));
+            let (mut names, mut last) = (Vec::new(), Name::before(Folder::Jobs));
+            loop {
+                // The record of an end directly precedes that of the open job: a job that ends meanwhile is not missed.
+                let some = self.index().names_after(&last, REFRESHED);
+                let Some(end) = some.last() else { return Ok(names) };
+                last = end.clone();
+                names.extend(some.into_iter().filter(|name| !name.is_batch()));
+            }
         }
-        Ok(self.list(Folder::Jobs).await?.into_iter().map(|(name, _)| name).collect())
+        let listed = self.list(Folder::Jobs).await?.into_iter().map(|(name, _)| name);
+        Ok(listed.filter(|name| !name.is_batch()).collect())
     }
 
     /// Writes an input again if half of its time to live has passed since its last write: other nodes know its last use

@@ -169,6 +169,25 @@ async fn the_last_use_survives_a_restart() {
 }
 
 #[tokio::test]
+async fn a_peek_is_no_use() {
+    let dir = tempfile::tempdir().unwrap();
+    let open = async || Store::open(&StoreConfig::default(), dir.path()).await.unwrap();
+    let (record, now) = (Name::ended_job("1").unwrap(), SystemTime::now());
+    open().await.put(&record, body(10)).await.unwrap();
+    let file = dir.path().join("store").join(record.to_string());
+    std::fs::File::open(&file).unwrap().set_modified(now - Duration::from_hours(20)).unwrap();
+    let store = open().await;
+    let is_used = async || {
+        store.sweep(now).await;
+        std::fs::metadata(&file).unwrap().modified().unwrap() > now - Duration::from_hours(19)
+    };
+    assert_eq!(store.peek(&record).await.unwrap(), Some(body(10)));
+    assert!(!is_used().await);
+    assert!(store.get(&record).await.unwrap().is_some() && is_used().await);
+    assert_eq!(store.peek(&Name::ended_job("2").unwrap()).await.unwrap(), None);
+}
+
+#[tokio::test]
 async fn objects_that_cannot_be_removed_still_count() {
     let (dir, faults, store) = faulty(1000).await;
     store.put(&name(1), body(600)).await.unwrap();

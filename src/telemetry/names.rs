@@ -110,7 +110,7 @@ metrics! {
     STRUCTURE_CACHE_REQUESTS = "molmesh_structure_cache_requests_total", Counter, result: "hit|miss";
     /// Bytes of structures that are kept in memory.
     STRUCTURE_CACHE_BYTES = "molmesh_structure_cache_bytes", Gauge;
-    /// Bytes of temporary files, which hold the indexes of tilesets.
+    /// Bytes of temporary files, which hold the indexes of tilesets, and archives of batches.
     SCRATCH_BYTES = "molmesh_scratch_bytes", Gauge;
     /// Bytes in the store.
     STORE_BYTES = "molmesh_store_bytes", Gauge, folder: "folders of the store";

@@ -735,6 +735,46 @@ fn areas_are_those_of_the_library() {
 }
 
 #[test]
+fn areas_of_an_upload_are_those_of_the_stored_structure() {
+    let server = start(Fake::new(Mode::Octahedra), |c| c.limits.body_bytes = 100_000);
+    let query = "surface=ses&probe=1.5&by=chain";
+    let uploaded = server.post(&format!("/v1/areas?{query}"), &[], SAMPLE);
+    assert_eq!((uploaded.status, uploaded.header("content-type")), (200, Some("text/csv")));
+    assert_eq!(uploaded.header("cache-control"), None);
+    let digest = molmesh::store::Digest::of(SAMPLE);
+    server.get(&format!("/v1/structures/{digest}")).problem(404, "no-such-structure");
+    let address = server.post("/v1/structures", &[], SAMPLE).header("location").unwrap().to_owned();
+    let stored = server.get(&format!("{address}/areas?{query}"));
+    assert!(stored.body == uploaded.body && stored.header("etag") == uploaded.header("etag"));
+    let field = |name: &str, value: &str| {
+        format!("--XX\r\ncontent-disposition: form-data; name=\"{name}\"\r\n\r\n{value}\r\n").into_bytes()
+    };
+    let text = std::str::from_utf8(SAMPLE).unwrap();
+    let form = [field("surface", "ses"), field("by", "chain"), field("file", text), b"--XX--\r\n".to_vec()].concat();
+    let json = format!("{{\"structure\": \"{digest}\", \"surface\": \"ses\", \"by\": \"chain\"}}").into_bytes();
+    let multipart = "multipart/form-data; boundary=XX";
+    for (content_type, body) in [(multipart, &form), ("application/json", &json)] {
+        let reply = server.post("/v1/areas?probe=1.5", &[("content-type", content_type)], body);
+        assert!(reply.status == 200 && reply.body == stored.body, "{content_type}: {}", reply.text());
+        // Parameters of the query are checked although the body may have others.
+        let reply = server.post("/v1/areas?prob=1.5", &[("content-type", content_type)], body);
+        assert_eq!(reply.problem(400, "bad-parameter")["nearest"], "probe", "{content_type}");
+    }
+    let mapped = [field("map", "x"), form].concat();
+    let reply = server.post("/v1/areas", &[("content-type", multipart)], &mapped);
+    assert_eq!(reply.problem(400, "bad-parameter")["parameter"], "map");
+    // These are rejected before the body arrives.
+    for (query, length, status) in [("", 10, 400), ("?surface=gaussian", 10, 400), ("?surface=sas", 100_001, 413)] {
+        let mut stream = http_support::connect(server.addr);
+        write!(stream, "POST /v1/areas{query} HTTP/1.1\r\nhost: localhost\r\ncontent-length: {length}\r\n\r\n")
+            .unwrap();
+        let reply = http_support::read_reply(&mut stream, false);
+        assert_eq!(reply.status, status, "{query}");
+        assert!(status != 400 || reply.json()["parameter"] == "surface", "{}", reply.text());
+    }
+}
+
+#[test]
 fn reports_list_at_most_a_thousand_chains() {
     let mut cif = b"data_x\nloop_\n_atom_site.type_symbol\n_atom_site.auth_asym_id\n_atom_site.Cartn_x\n\
                     _atom_site.Cartn_y\n_atom_site.Cartn_z\n"

@@ -120,7 +120,7 @@ fn objects_of_another_group_do_not_exist_for_a_key() {
             assert_eq!(found.status, 404, "{method} {path} {headers:?}");
         }
     }
-    for path in ["/v1/meshes", "/v1/report", "/v1/estimate"] {
+    for path in ["/v1/meshes", "/v1/report", "/v1/estimate", "/v1/areas?surface=sas"] {
         let names = |structure: &str| format!("{{\"structure\": \"{}\"}}", structure.rsplit('/').next().unwrap());
         let ask = |structure: &str| setup.ask("b", "POST", path, &[json], names(structure).as_bytes());
         let (found, never) = (ask(structure), ask(&other(structure)));

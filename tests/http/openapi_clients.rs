@@ -1,5 +1,5 @@
 //! Clients generated from the OpenAPI document: each meshes a file, follows a job to its end, fetches the result,
-//! requests a report and receives a typed error.
+//! requests a report and receives a typed error. The hand-written client, `web/client`, passes its own tests.
 
 use crate::http_support;
 use crate::tools;
@@ -12,7 +12,10 @@ use http_support::{Running, start};
 use molmesh::surface::CpuBackend;
 use tempfile::TempDir;
 
-static SERVER: LazyLock<Running> = LazyLock::new(|| start(Arc::new(CpuBackend::new(None).unwrap()), |_| {}));
+/// Service whose archive has the samples.
+static SERVER: LazyLock<Running> = LazyLock::new(|| {
+    start(Arc::new(CpuBackend::new(None).unwrap()), |config| config.archive.dir = Some(root("samples")))
+});
 
 fn root(path: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join(path)
@@ -30,9 +33,11 @@ fn run(command: &mut Command) -> String {
     text
 }
 
-/// Returns a folder with `openapi.json`.
+/// Returns a folder with `openapi.json`, beside the Node packages of the tests, where generated code finds them.
 fn folder() -> (TempDir, PathBuf) {
-    let folder = tempfile::tempdir().unwrap();
+    let node = root("target/test-tools/node");
+    std::fs::create_dir_all(&node).unwrap();
+    let folder = tempfile::tempdir_in(node).unwrap();
     let document = folder.path().join("openapi.json");
     std::fs::write(&document, SERVER.get("/openapi.json").body).unwrap();
     (folder, document)
@@ -116,4 +121,28 @@ fn hey_api() {
     generate.args(["--client", "@hey-api/client-fetch", "--no-log-file", "--input"]).arg(document);
     run(generate.arg("--output").arg(folder.path().join("client")));
     typescript("hey_api.ts", folder.path());
+}
+
+#[test]
+fn openapi_fetch() {
+    let generator = root("target/test-tools/node/node_modules/.bin/openapi-typescript");
+    if !generator.is_file() {
+        return tools::missing("openapi-typescript").unwrap_or(());
+    }
+    let (folder, document) = folder();
+    run(Command::new(generator).arg(document).arg("--output").arg(folder.path().join("client.ts")));
+    typescript("openapi_fetch.ts", folder.path());
+}
+
+#[test]
+fn typed_client() {
+    let package = root("web/client");
+    let compiler = root("target/test-tools/node/node_modules/.bin/tsc");
+    if !package.join("dist").is_dir() || !compiler.is_file() {
+        return tools::missing("the package @molmesh/client (make web), or its compiler,").unwrap_or(());
+    }
+    run(Command::new("node").arg(package.join("test/client.test.mjs")).env("MOLMESH_URL", url()));
+    for project in ["tsconfig.json", "tsconfig.react.json"] {
+        run(Command::new(&compiler).arg("-p").arg(package.join("test").join(project)));
+    }
 }

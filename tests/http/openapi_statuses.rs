@@ -44,7 +44,7 @@ fn archive(dir: &Path, id: &str, bytes: &[u8]) {
 const DOCUMENTS: [&str; 5] = ["atoms", "colors?scheme=chain", "areas?surface=sas", "tileset.json", "tileset.subtree"];
 
 /// Operations that take a structure.
-const UPLOADS: [&str; 4] = ["/v1/meshes", "/v1/report", "/v1/estimate", "/v1/structures"];
+const UPLOADS: [&str; 5] = ["/v1/meshes", "/v1/report", "/v1/estimate", "/v1/areas?surface=sas", "/v1/structures"];
 
 fn location(reply: &Reply) -> String {
     reply.header("location").unwrap().to_owned()
@@ -97,7 +97,7 @@ fn uploads(seen: &Seen, server: &Running) {
     assert_eq!(octets.header("content-type"), Some("application/octet-stream"));
     // An estimate is JSON for every `Accept`.
     seen.expect(200, addr, ("POST", "/v1/estimate"), &[("accept", "application/json")], SAMPLE);
-    for path in &UPLOADS[..3] {
+    for path in &UPLOADS[..4] {
         seen.expect(404, addr, ("POST", path), &[JSON], br#"{"pdb_id": "9xyz"}"#);
     }
 }
@@ -213,6 +213,7 @@ fn jobs(seen: &Seen) {
     }
     seen.expect(500, server.addr, ("DELETE", &format!("/v1/jobs/{damaged}")), &[], b"");
     get(&format!("{NO_JOB}?wait=1000"), 400);
+    get("/v1/jobs?limit=0", 400);
     // A job without a result ends with the problem of a synchronous request.
     result(&ended(seen, &server, format!("HEADER{}", " ".repeat(100_001)).as_bytes()), 413);
     result(&ended(seen, &server, b"HEADER\nnothing"), 422);
@@ -228,6 +229,53 @@ fn jobs(seen: &Seen) {
     seen.expect(504, late.addr, ("GET", &format!("{job}/result")), &[], b"");
 }
 
+/// Batches that succeed, are cancelled or are refused.
+fn batches(seen: &Seen) {
+    let backend = Fake::new(Mode::Octahedra);
+    let server = start(Arc::clone(&backend) as _, |c| (c.broker.queue, c.jobs.workers) = (2, 1));
+    let addr = server.addr;
+    let archive = |n: usize| {
+        let mut builder = tar::Builder::new(Vec::new());
+        for n in [n, n + 1] {
+            let mut header = tar::Header::new_gnu();
+            header.set_size(sample(n).len() as u64);
+            builder.append_data(&mut header, format!("{n}.pdb"), &sample(n)[..]).unwrap();
+        }
+        builder.into_inner().unwrap()
+    };
+    let post = ("POST", "/v1/batches");
+    let key = [("idempotency-key", "k")];
+    let batch = location(&seen.expect(202, addr, post, &key, &archive(0)));
+    seen.expect(422, addr, post, &key, &archive(10));
+    seen.expect(415, addr, post, &[("content-encoding", "br")], &archive(0));
+    seen.expect(400, addr, post, &[], b"nothing");
+    let get = |path: &str, headers: &[(&str, &str)], status| seen.expect(status, addr, ("GET", path), headers, b"");
+    get(&format!("{batch}/results.tar"), &[], 200);
+    get(&batch, &[], 200);
+    get(&format!("{batch}?limit=9999"), &[], 400);
+    get(&format!("{batch}/events"), &[], 200);
+    get(&format!("{batch}/events"), &[("last-event-id", "end")], 204);
+    seen.expect(409, addr, ("DELETE", &batch), &[], b"");
+    let damaged = "1".repeat(32);
+    std::fs::write(server.dir.path().join(format!("store/jobs/{damaged}.batch.json")), "{").unwrap();
+    for (id, status) in [(&damaged, 500), (&"0".repeat(32), 404)] {
+        for path in ["", "/events", "/results.tar"] {
+            get(&format!("/v1/batches/{id}{path}"), &[], status);
+        }
+        seen.expect(status, addr, ("DELETE", &format!("/v1/batches/{id}")), &[], b"");
+    }
+    backend.set(Mode::Held);
+    let held = location(&seen.expect(202, addr, post, &[], &archive(20)));
+    wait_for("one runs", || get(&held, &[], 200).json()["counts"]["running"] == 1);
+    seen.expect(503, addr, post, &[], &archive(30));
+    seen.expect(200, addr, ("DELETE", &held), &[], b"");
+    break_store(server.dir.path());
+    for path in ["", "/events", "/results.tar"] {
+        get(&format!("{batch}{path}"), &[], 503);
+    }
+    seen.expect(503, addr, ("DELETE", &batch), &[], b"");
+}
+
 /// Limits of bodies and atom lists, and an archive that fails.
 fn sizes(seen: &Seen) {
     let small = fake(Mode::Octahedra, |c| {
@@ -235,7 +283,7 @@ fn sizes(seen: &Seen) {
         c.limits.inflated_bytes = 100;
         c.server.body_timeout_ms = 200;
     });
-    for path in UPLOADS {
+    for path in UPLOADS.into_iter().chain(["/v1/batches"]) {
         seen.expect(413, small.addr, ("POST", path), &[], SAMPLE);
         let mut stream = connect(small.addr);
         let head =
@@ -263,9 +311,10 @@ fn sizes(seen: &Seen) {
     seen.expect(424, away.addr, ("GET", "/v1/pdb/9xyz/report.json"), &[], b"");
     let few = fake(Mode::Octahedra, |c| c.limits.labels = 10);
     seen.expect(422, few.addr, ("GET", "/v1/pdb/4pti/atoms"), &[], b"");
-    for path in &UPLOADS[..3] {
+    for path in &UPLOADS[..4] {
         seen.expect(424, away.addr, ("POST", path), &[JSON], br#"{"pdb_id": "9xyz"}"#);
     }
+    seen.expect(424, away.addr, ("POST", "/v1/batches"), &[JSON], br#"{"pdb_ids": ["9xyz"]}"#);
 }
 
 /// Backends that panic or do not end, a full queue, and exhausted memory.
@@ -361,7 +410,7 @@ fn restarts(seen: &Seen) {
     let server = begin(|_| {});
     break_store(folder.path());
     let report = result.replace(".glb", "/report.json");
-    for path in [&job, &format!("{job}/events"), &format!("{job}/result"), &result, &report] {
+    for path in ["/v1/jobs", &job, &format!("{job}/events"), &format!("{job}/result"), &result, &report] {
         get(&server, path, 503);
     }
     seen.expect(503, server.addr, ("DELETE", &job), &[], b"");
@@ -410,6 +459,7 @@ fn the_server_returns_every_documented_status_and_no_other() {
     uploads(&seen, &server);
     surfaces(&seen, &server);
     jobs(&seen);
+    batches(&seen);
     sizes(&seen);
     failures(&seen);
     restarts(&seen);

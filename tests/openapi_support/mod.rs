@@ -87,7 +87,7 @@ impl Seen {
         if media_type == "application/problem+json" {
             let (types, found) = (described["description"].as_str().unwrap(), reply.json()["type"].clone());
             let slug = found.as_str().and_then(|found| found.strip_prefix("/problems/")).unwrap_or_default();
-            if !types.contains(&format!("`{slug}`: ")) {
+            if !types.contains(&format!("`{slug}`")) {
                 return Err(format!("{operation}: {status} is {found}, not one of {types}"));
             }
         }

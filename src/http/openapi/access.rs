@@ -6,7 +6,7 @@ use utoipa::openapi::security::SecurityRequirement;
 
 use super::problems;
 use crate::access::Scope;
-use crate::http::operations::TABLE;
+use crate::http::operations::{Parameters, TABLE};
 
 /// Adds the security requirements, from the table that authorizes requests.
 pub(super) fn restrict_operations(api: &mut OpenApi) {
@@ -20,12 +20,15 @@ pub(super) fn restrict_operations(api: &mut OpenApi) {
             _ => None,
         });
         if let Some(operation) = operation {
-            restrict(operation, scope, row.method == axum::http::Method::GET);
+            // A signature is valid for one URL; a list and a tileset have many.
+            let is_signable = row.method == axum::http::Method::GET
+                && !matches!(row.parameters, Parameters::Jobs | Parameters::Tileset);
+            restrict(operation, scope, is_signable);
         }
     }
 }
 
-fn restrict(operation: &mut Operation, scope: Scope, is_get: bool) {
+fn restrict(operation: &mut Operation, scope: Scope, is_signable: bool) {
     let scopes = || [scope.name()];
     let nothing: [&str; 0] = [];
     // The empty requirement: a server without keys accepts every request.
@@ -35,7 +38,7 @@ fn restrict(operation: &mut Operation, scope: Scope, is_get: bool) {
         SecurityRequirement::new("apiKey", scopes()),
     ];
     let mut groups = vec![problems::KEY];
-    if is_get {
+    if is_signable {
         security.push(SecurityRequirement::new("signedAddress", nothing));
         groups.push(problems::SIGNED_URL);
     }

@@ -1,4 +1,4 @@
-//! Request bodies in the OpenAPI document.
+//! Bodies that are files in the OpenAPI document.
 //!
 //! An operation declares the bytes of a file alone. Forms and JSON, which the server accepts as well, are components:
 //! generators choose one body for an operation, most of them JSON if it is declared, and their clients could not send
@@ -16,6 +16,10 @@ JSON that names a structure on the server (component `StructureByName`).";
 /// Description of the same body for other operations.
 pub(in crate::http) const AS_FOR_MESHES: &str = "The same bodies as for `POST /v1/meshes`.";
 
+/// Description of the body of a batch.
+pub(in crate::http) const BATCH_FILES: &str = "A tar archive, plain or compressed with gzip, or a zip archive. JSON is \
+accepted as well: `pdb_ids`, a list of PDB ids, and parameters.";
+
 /// Returns a schema for bytes.
 pub(super) fn binary(doc: &str) -> ObjectBuilder {
     let binary = SchemaFormat::KnownFormat(KnownFormat::Binary);
@@ -32,5 +36,27 @@ impl PartialSchema for StructureFile {
         RefOr::T(
             binary("A PDB, mmCIF, BinaryCIF, PQR or XYZ file, uncompressed or compressed with gzip or zstd.").into(),
         )
+    }
+}
+
+/// Bytes of a subtree of a tileset.
+pub(in crate::http) enum SubtreeFile {}
+
+impl ToSchema for SubtreeFile {}
+
+impl PartialSchema for SubtreeFile {
+    fn schema() -> RefOr<Schema> {
+        RefOr::T(binary("A subtree of 3D Tiles 1.1.").into())
+    }
+}
+
+/// Bytes of an archive.
+pub(in crate::http) enum ArchiveFile {}
+
+impl ToSchema for ArchiveFile {}
+
+impl PartialSchema for ArchiveFile {
+    fn schema() -> RefOr<Schema> {
+        RefOr::T(binary("An archive of files.").into())
     }
 }

@@ -9,7 +9,8 @@ use utoipa::openapi::{KnownFormat, ObjectBuilder, OpenApi, Ref, RefOr, Required,
 
 use super::components::pascal_case;
 use crate::formats::Format;
-use crate::http::{atom_parameters, color_parameters};
+use crate::http::job_list::{DEFAULT_LIMIT, MAX_LIMIT};
+use crate::http::{atom_parameters, batch_plan, color_parameters};
 use crate::pipeline::params::{self, Domain, TABLE};
 use crate::pipeline::{AreaLevel, areas, tileset};
 use crate::surface::SurfaceKind;
@@ -124,6 +125,20 @@ fn own(name: &str, required: Required, doc: impl Into<String>, schema: ObjectBui
     builder.description(Some(doc.into())).schema(Some(schema)).build()
 }
 
+/// Describes the parameter that limits the size of a page.
+fn page_limit() -> Parameter {
+    let limit = ObjectBuilder::new().schema_type(Type::Integer).minimum(Some(1)).maximum(Some(MAX_LIMIT));
+    own("limit", Required::False, "Maximum size of the page.", limit.default(Some(Value::from(DEFAULT_LIMIT))))
+}
+
+/// Describes the parameter that selects the rows of a table of areas.
+fn rows() -> Parameter {
+    let levels = ObjectBuilder::new().schema_type(Type::String).enum_values(Some(AreaLevel::ALL.map(AreaLevel::name)));
+    let levels = levels.default(Some(Value::from(AreaLevel::default().name())));
+    let doc = "Rows of the table of areas. Value: atom, residue or chain. Default: residue.";
+    own(params::areas::BY, Required::False, doc, levels)
+}
+
 fn path(name: &str, doc: &str) -> ParameterBuilder {
     let builder = ParameterBuilder::new().name(name).parameter_in(ParameterIn::Path);
     builder.required(Required::True).description(Some(doc))
@@ -151,6 +166,14 @@ fn headers(all: &[Header]) -> Vec<Parameter> {
     all.iter().map(one).collect()
 }
 
+/// `Idempotency-Key`. Tabs are allowed at both ends, where HTTP removes them.
+const IDEMPOTENCY_KEY: Header = (
+    "Idempotency-Key",
+    Some("^[\\t ]*[ -~]{1,255}[\\t ]*$"),
+    "upload-1",
+    "Key chosen by the client, 1 to 255 characters. A repeated request with the same key returns the same job or batch.",
+);
+
 /// Declares a type for `params(…)` of an operation.
 macro_rules! parameters {
     ($(#[$doc:meta])* $type:ident: $parameters:expr) => {
@@ -168,6 +191,22 @@ macro_rules! parameters {
 parameters!(
     /// Query parameters of a mesh.
     MeshParameters: TABLE.iter().map(query).collect()
+);
+parameters!(
+    /// Query parameters of a batch.
+    BatchParameters: {
+        let outputs = ObjectBuilder::new().schema_type(Type::String).min_length(Some(1)).title(Some(batch_plan::expected()));
+        let outputs = outputs.default(Some(Value::from(Format::default().name()))).examples(["glb,png"]);
+        let doc = format!(
+            "Outputs of each file: names of formats, and `areas` for a table of exact areas. A parameter applies to the \
+             outputs that have it. Value: {}. Default: glb.", batch_plan::expected()
+        );
+        let own = [
+            own(batch_plan::OUTPUTS, Required::False, doc, outputs),
+            rows(),
+        ];
+        own.into_iter().chain(TABLE.iter().filter(|parameter| parameter.name != "format").map(query)).collect()
+    }
 );
 parameters!(
     /// Parameters of a mesh whose path names the format.
@@ -211,18 +250,15 @@ parameters!(
     /// Query parameters of the areas of atoms.
     AreaParameters: {
         let text = || ObjectBuilder::new().schema_type(Type::String);
-        let levels = text().enum_values(Some(AreaLevel::ALL.map(AreaLevel::name)));
-        let levels = levels.default(Some(Value::from(AreaLevel::default().name())));
         let surfaces = text().enum_values(Some(params::areas::SURFACES.map(SurfaceKind::name)));
         let interfaces = text().min_length(Some(1)).max_length(Some(params::MAX_VALUE_BYTES));
         let interfaces = interfaces.title(Some(areas::EXPECTED));
-        let rows = "Rows of the table. Value: atom, residue or chain. Default: residue.";
         let doc = format!(
             "Compares two sets of chains: the rows are those of both sides together, with the areas `alone` and \
              `buried`. Value: {}.", areas::EXPECTED
         );
         let own = vec![
-            own(params::areas::BY, Required::False, rows, levels),
+            rows(),
             own("surface", Required::True, "Type of the surface. Value: vdw, sas or ses.", surfaces),
             own("interface", Required::False, doc, interfaces),
         ];
@@ -248,6 +284,32 @@ parameters!(
 parameters!(
     /// `{id}` of a job.
     JobPath: segment("id", "Id of the job.", "^[0-9a-f]{32}$", "0123456789abcdef0123456789abcdef")
+);
+parameters!(
+    /// Query parameters of a list of jobs.
+    JobListParameters: {
+        let state = ParameterBuilder::new().name("state").parameter_in(ParameterIn::Query).required(Required::False);
+        let state = state.description(Some("Status of the jobs. Default: every status."));
+        vec![
+            state.schema(Some(Ref::from_schema_name("JobStatus"))).build(),
+            page_limit(),
+            own(
+                "after", Required::False, "Position of the page, from the link `next` of the page before.",
+                text("^[0-9a-f]{1,32}$", "3f2"),
+            ),
+        ]
+    }
+);
+parameters!(
+    /// Query parameters of a page of the files of a batch.
+    BatchPageParameters: {
+        let offset = ObjectBuilder::new().schema_type(Type::Integer).minimum(Some(0)).default(Some(Value::from(0)));
+        vec![own("offset", Required::False, "Number of files to skip.", offset), page_limit()]
+    }
+);
+parameters!(
+    /// `{id}` of a batch.
+    BatchPath: segment("id", "Id of the batch.", "^[0-9a-f]{32}$", "0123456789abcdef0123456789abcdef")
 );
 parameters!(
     /// `{key}` of a result.
@@ -278,12 +340,12 @@ parameters!(
             "Urgency from `u=0` (most urgent) to `u=7` (RFC 9218). It orders the waiting requests of one client. Jobs \
              of all clients have three levels: 0 to 2, 3 and 4, 5 to 7.",
         ),
-        (
-            // Tabs are allowed at both ends, where HTTP removes them.
-            "Idempotency-Key", Some("^[\\t ]*[ -~]{1,255}[\\t ]*$"), "upload-1",
-            "Key chosen by the client, 1 to 255 characters. A repeated request with the same key returns the same job.",
-        ),
+        IDEMPOTENCY_KEY,
     ])
+);
+parameters!(
+    /// Headers of a batch.
+    BatchHeaders: headers(&[IDEMPOTENCY_KEY])
 );
 parameters!(
     /// Compression of an upload.

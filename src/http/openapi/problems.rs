@@ -83,11 +83,16 @@ pub(in crate::http) fn responses(groups: &[&[ProblemType]]) -> BTreeMap<String, 
 
 /// Returns the response for the problem types of one status.
 fn response(rows: &[&ProblemEntry]) -> Response {
-    let described: Vec<String> = rows.iter().map(|row| format!("`{}`: {}.", row.slug, row.title)).collect();
+    // Titles only of few types: the document would be longer by 4 kB, and the schema of problems lists all types.
+    let has_titles = rows.len() <= 2;
+    let describe = |row: &&ProblemEntry| {
+        if has_titles { format!("`{}`: {}.", row.slug, row.title) } else { format!("`{}`", row.slug) }
+    };
+    let described: Vec<String> = rows.iter().map(describe).collect();
     let names: Vec<&str> = rows.iter().map(|row| row.slug).collect();
     let problem = Ref::from_schema_name(ProblemDocument::name());
     let mut response = ResponseBuilder::new()
-        .description(described.join(" "))
+        .description(described.join(if has_titles { " " } else { ", " }))
         .content(MEDIA_TYPE, ContentBuilder::new().schema(Some(problem)).build())
         .extensions(Some(Extensions::from_iter([(PROBLEM_TYPES_EXTENSION, Value::from(names))])));
     let has = |problem_types: &[ProblemType]| rows.iter().any(|row| problem_types.contains(&row.problem_type));

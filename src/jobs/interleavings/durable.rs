@@ -15,6 +15,7 @@ use shuttle::scheduler::RandomScheduler;
 
 use super::super::coalesced_job::QueuedTask;
 use super::super::queue::Queue;
+use super::super::record::decode;
 use super::super::{
     Budget, ContentKey, EndError, Failure, JobId, JobRecord, JobSpec, JobStore, JobView, Lane, MemoryBroker, OnStart,
     Pool, REPORT, Settings, Status, results,
@@ -73,6 +74,7 @@ impl Fixture {
             parameters: Vec::new(),
             format: Format::Glb,
             idempotency_key: Some(KEY.to_owned()),
+            batch: None,
         };
         let mut client = Client { fixture: self, ended: false };
         client.sees(&block_on(self.jobs.accept(spec, None)).unwrap());
@@ -83,14 +85,14 @@ impl Fixture {
     fn on_record(&self) -> Option<JobRecord> {
         let path = Path::from(Name::ended_job(id().as_str()).unwrap().to_string());
         let found = self.objects.get(&path).now_or_never().unwrap().ok()?;
-        Some(JobRecord::from_bytes(&found.bytes().now_or_never().unwrap().unwrap()).unwrap())
+        Some(decode::<JobRecord>(&found.bytes().now_or_never().unwrap().unwrap()).unwrap())
     }
 
     /// Returns the record of the open job in the store, without a step of the scheduler.
     fn open_record(&self) -> JobRecord {
         let path = Path::from(Name::job(id().as_str()).unwrap().to_string());
         let found = self.objects.get(&path).now_or_never().unwrap().unwrap();
-        JobRecord::from_bytes(&found.bytes().now_or_never().unwrap().unwrap()).unwrap()
+        decode::<JobRecord>(&found.bytes().now_or_never().unwrap().unwrap()).unwrap()
     }
 
     /// Stores a result of the job.

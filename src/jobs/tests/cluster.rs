@@ -47,6 +47,7 @@ impl Node {
             parameters: vec![("resolution".to_owned(), resolution.to_owned())],
             format: Format::Stl,
             idempotency_key: key.map(str::to_owned),
+            batch: None,
         };
         self.jobs.accept(spec, None).await.unwrap().record.id
     }

@@ -48,9 +48,7 @@ pub fn parse(pairs: &[(String, String)]) -> Result<AreasRequest, ParamError> {
         let expected = format!("{}, which have exact areas", SURFACES.map(SurfaceKind::name).join(", "));
         return Err(ParamError::bad_value("surface", surface, expected));
     }
-    if value_of(pairs, "model").is_some_and(|model| model.trim() == "all") {
-        return Err(ParamError::bad_value("model", "all", "the number of one model"));
-    }
+    check_one_model(pairs)?;
     let (own, mesh_pairs): (Vec<_>, Vec<_>) = pairs.iter().partition(|(name, _)| name == BY);
     let mesh_pairs = mesh_pairs.iter().map(|(name, value)| (name.as_str(), value.as_str()));
     let options = super::parse(mesh_pairs.chain([("exact", "true")]))?.options;
@@ -63,6 +61,17 @@ pub fn parse(pairs: &[(String, String)]) -> Result<AreasRequest, ParamError> {
     };
     let canonical = format!("{BY}={}&{}", level.name(), super::canonical(&options));
     Ok(AreasRequest { options, level, canonical })
+}
+
+/// Rejects `model=all`.
+///
+/// # Errors
+/// Returns [`ParamError::BadValue`].
+pub fn check_one_model(pairs: &[(String, String)]) -> Result<(), ParamError> {
+    if value_of(pairs, "model").is_some_and(|model| model.trim() == "all") {
+        return Err(ParamError::bad_value("model", "all", "the number of one model"));
+    }
+    Ok(())
 }
 
 fn value_of<'a>(pairs: &'a [(String, String)], name: &str) -> Option<&'a str> {
