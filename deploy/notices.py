@@ -1,12 +1,13 @@
 #!/usr/bin/env python3
 """Writes the licences of everything in the binary to standard output.
 
-Covers the crates that cargo links into `molmesh` (normal dependencies for the target and features) with all their
-licence and notice files, meshoptimizer, the standard library, musl if the target uses it, and third-party parts of the
-web pages. For a crate without a licence file, the text of a licence that it names is used:
-Apache-2.0, or MIT with its authors. If the crate permits neither, the command fails and names it.
+Covers the crates that cargo links into `molmesh`, and into other packages of the workspace that are named (normal
+dependencies for the target and features), with all their licence and notice files, meshoptimizer, the standard library,
+musl if the target uses it, and third-party parts of the web pages. For a crate without a licence file, the text of a
+licence that it names is used: Apache-2.0, or MIT with its authors. If the crate permits neither, the command fails and
+names it.
 
-Usage: deploy/notices.py [--target TRIPLE] [--no-default-features]
+Usage: deploy/notices.py [--target TRIPLE] [--no-default-features] [--package molmesh-python]
 """
 
 import argparse
@@ -42,11 +43,11 @@ def host():
     return next(line.split()[1] for line in lines if line.startswith("host:"))
 
 
-def linked(metadata, target, chosen):
-    """Returns the packages linked into molmesh, without those of the workspace, sorted by name and version."""
+def linked(metadata, target, chosen, others):
+    """Returns the packages linked into molmesh and `others`, sorted, without those of the workspace."""
     # `cargo metadata` joins the features of all members of the workspace; `cargo tree` takes those of one package.
-    tree = ["tree", "--locked", "--package=molmesh", "--edges=normal", "--prefix=none", "--format={p}", f"--target={target}"]
-    lines = cargo(*tree, *chosen).decode().splitlines()
+    tree = ["tree", "--locked", "--edges=normal", "--prefix=none", "--format={p}", f"--target={target}", *chosen]
+    lines = cargo(*tree, *(f"--package={name}" for name in ["molmesh", *others])).decode().splitlines()
     crates = {tuple(line.split()[:2]) for line in lines if line}
     # Packages of the workspace have no source.
     packages = [p for p in metadata["packages"] if p["source"] and (p["name"], f"v{p['version']}") in crates]
@@ -127,11 +128,12 @@ def main():
     parser = argparse.ArgumentParser()
     parser.add_argument("--target", default=host())
     parser.add_argument("--no-default-features", action="store_true")
+    parser.add_argument("--package", action="append", default=[])
     options = parser.parse_args()
     target, musl = options.target, options.target.endswith("-musl")
     chosen = ["--no-default-features"] if options.no_default_features else []
     metadata = json.loads(cargo("metadata", "--format-version=1", "--locked", f"--filter-platform={target}"))
-    packages = linked(metadata, target, chosen)
+    packages = linked(metadata, target, chosen, options.package)
     line = "-" * 100
     print("molmesh is licensed under MIT OR Apache-2.0, at your option. It contains third-party software, listed here with")
     print(f"its licences ({target}).\n")

@@ -1,6 +1,6 @@
 //! `molmesh.areas`.
 
-use molmesh_pipeline::areas::measure_selection;
+use molmesh_pipeline::areas::measure_selected;
 use molmesh_pipeline::params::areas::{AreasRequest, BY, parse};
 use molmesh_pipeline::{AreaLevel, AreaRow, JobLimits};
 use molmesh_structure::{Structure, element};
@@ -12,7 +12,7 @@ use pyo3::types::PyDict;
 use crate::columns::ColumnData;
 use crate::error::{Failure, parameter_error};
 use crate::parameters::{pairs, selection_of, with_selection};
-use crate::source::Source;
+use crate::source::{Atoms, Source};
 use crate::work;
 
 /// Computes exact areas of a surface of spheres, without a mesh.
@@ -74,10 +74,10 @@ pub(crate) fn areas<'py>(
     let request = parse(&with_selection(&source, given)?).map_err(|error| parameter_error(&error))?;
     let columns = work::run(py, progress, "read", move |control, tracker| {
         let AreasRequest { options, level, .. } = request;
-        let JobLimits { read, surface, .. } = JobLimits::default();
-        let atoms = source.load(&options.selection, selection, false, control, tracker)?;
-        let structure = &*atoms.structure;
-        let measured = measure_selection(structure, &options, &read, &surface, control)?.areas;
+        let atoms = source.load(false, control, tracker)?.select(&options.selection, selection, control)?;
+        let Atoms { structure, selected, spheres, .. } = &*atoms;
+        let limits = JobLimits::default().surface;
+        let (_, measured) = measure_selected(structure, selected, spheres, &options, &limits, control)?;
         let rows = measured.rows(structure, level, control, &Reservation::new(&control.memory))?;
         let mut columns = if is_spheres { Vec::new() } else { names(structure, level, &rows)? };
         columns.extend(numbers(level, &rows, measured.has_parts()));

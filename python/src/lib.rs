@@ -15,6 +15,7 @@ mod error;
 mod mesh;
 mod parameters;
 mod read;
+mod regions;
 mod render;
 mod save;
 mod source;
@@ -41,10 +42,14 @@ fn _molmesh(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add("PARAMETERS", parameters)?;
     module.add_class::<structure::PyStructure>()?;
     module.add_class::<mesh::PyMesh>()?;
+    module.add_class::<regions::PyCavity>()?;
+    module.add_class::<regions::PyPocket>()?;
     for function in [
         wrap_pyfunction!(read::read, module)?,
         wrap_pyfunction!(surface::surface, module)?,
         wrap_pyfunction!(areas::areas, module)?,
+        wrap_pyfunction!(regions::find_cavities, module)?,
+        wrap_pyfunction!(regions::find_pockets, module)?,
         wrap_pyfunction!(render::render, module)?,
     ] {
         function.setattr("__module__", "molmesh")?;

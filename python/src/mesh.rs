@@ -49,17 +49,16 @@ impl MeshContent {
 }
 
 impl PyMesh {
-    /// Takes the mesh of a product. `atoms` are those of its source.
+    /// Takes the mesh of a product. `atoms` are those of its source, for a mesh with indices of atoms.
     pub(crate) fn new(
         product: Product,
         is_meshopt: bool,
-        atoms: &Atoms,
+        atoms: Option<&Atoms>,
         control: &Control<'_>,
     ) -> Result<Self, Failure> {
         let Product { mut mesh, bounds, storage, report, .. } = product;
         mesh.make_contiguous();
-        let atom =
-            mesh.atom_ids.is_some().then(|| atoms.rows_of(&mesh, control)).transpose()?.map(ColumnData::from_numbers);
+        let atom = atoms.map(|atoms| atoms.rows_of(&mesh, control)).transpose()?.map(ColumnData::from_numbers);
         let content = MeshContent { mesh: Arc::new(mesh), storage, bounds, is_meshopt, report, atom };
         let (vertices, normals, report) = (OnceLock::new(), OnceLock::new(), PyOnceLock::new());
         Ok(Self { content: Arc::new(content), vertices, normals, report })

@@ -64,7 +64,7 @@ pub(crate) fn read(
     let selection = selection_of(&given);
     let request = parameters::parse(&source, given, Format::default())?;
     let atoms = work::run(py, progress, "read", move |control, tracker| {
-        source.load(&request.options.selection, selection, request.strict, control, tracker)
+        source.load(request.strict, control, tracker)?.select(&request.options.selection, selection, control)
     })?;
     Ok(PyStructure::new(atoms))
 }

@@ -26,10 +26,11 @@ const MAX_WRITE: usize = 1 << 20;
 pub(crate) fn format_of(path: &Path, name: Option<&str>) -> PyResult<Format> {
     let extension = path.extension().map(|extension| extension.to_string_lossy());
     let Some(name) = name.or(extension.as_deref()) else {
-        let message = format!("`{}` has no extension; expected one of a format, or format=", path.display());
+        let known = Format::NAMES.join(", ");
+        let message = format!("`{}` has no extension; expected one of {known}, or the argument format", path.display());
         return Err(PyValueError::new_err(message));
     };
-    name.parse::<Format>().map_err(|error| PyValueError::new_err(error.to_string()))
+    name.parse::<Format>().map_err(|error| PyValueError::new_err(format!("`{}`: {error}", path.display())))
 }
 
 /// Writes a mesh, or its picture.

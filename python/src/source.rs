@@ -98,22 +98,15 @@ impl Source {
         matches!(self, Self::Spheres(_))
     }
 
-    /// Reads and selects the atoms. `strict` runs the strict validator first.
+    /// Reads the structure. `strict` runs the strict validator first.
     ///
     /// # Errors
-    /// Returns the failures of reading and selecting.
-    pub(crate) fn load(
-        self,
-        selection: &Selection,
-        parameters: Pairs,
-        strict: bool,
-        control: &Control<'_>,
-        tracker: &Tracker,
-    ) -> Result<Arc<Atoms>, Failure> {
+    /// Returns the failures of reading.
+    pub(crate) fn load(self, strict: bool, control: &Control<'_>, tracker: &Tracker) -> Result<Loaded, Failure> {
         let limits = ReadLimits::default();
         tracker.progress("read", 0.0);
         let structure = match self {
-            Self::Atoms(atoms) => return Ok(atoms),
+            Self::Atoms(atoms) => return Ok(Loaded::Selected(atoms)),
             Self::Spheres(spheres) => from_spheres(&spheres, &limits, control)?,
             Self::Content(content) => {
                 let bytes = content.read(Limit::InflatedBytes, limits.max_inflated_bytes)?;
@@ -121,6 +114,39 @@ impl Source {
             }
         };
         tracker.progress("read", 1.0);
+        Ok(Loaded::Read(Arc::new(structure)))
+    }
+}
+
+/// Structure of a source, with its atoms if `read()` has selected them.
+pub(crate) enum Loaded {
+    Read(Arc<Structure>),
+    Selected(Arc<Atoms>),
+}
+
+impl Loaded {
+    pub(crate) fn structure(&self) -> &Arc<Structure> {
+        match self {
+            Self::Read(structure) => structure,
+            Self::Selected(atoms) => &atoms.structure,
+        }
+    }
+
+    /// Selects the atoms. `parameters` are those of the selection.
+    ///
+    /// # Errors
+    /// Returns the failures of selecting.
+    pub(crate) fn select(
+        self,
+        selection: &Selection,
+        parameters: Pairs,
+        control: &Control<'_>,
+    ) -> Result<Arc<Atoms>, Failure> {
+        let structure = match self {
+            Self::Selected(atoms) => return Ok(atoms),
+            Self::Read(structure) => structure,
+        };
+        let limits = ReadLimits::default();
         // The rows are the selected atoms: no other atoms of the context, and no instances.
         let has_units = selection.instances || selection.unit.is_some();
         let selection = Selection {
@@ -132,7 +158,8 @@ impl Source {
         };
         let selected = select_with(&structure, &selection, &limits, control)?;
         let spheres = selected.spheres(&structure)?;
-        Ok(Arc::new(Atoms { structure: Arc::new(structure), selected, spheres, parameters }))
+        selected.check_duplicates(&spheres, &limits, control)?;
+        Ok(Arc::new(Atoms { structure, selected, spheres, parameters }))
     }
 }
 

@@ -32,6 +32,7 @@ struct Columns {
     residues: OnceLock<ColumnData>,
     chains: OnceLock<ColumnData>,
     b_factors: OnceLock<ColumnData>,
+    charges: OnceLock<ColumnData>,
     indices: OnceLock<ColumnData>,
 }
 
@@ -139,6 +140,18 @@ impl PyStructure {
         }
         self.column(py, &self.columns.b_factors, |atoms| {
             Ok(ColumnData::from_numbers(atoms.rows(|structure, i| structure.b_factor[i])))
+        })
+        .map(Some)
+    }
+
+    /// Partial charges, float32 (n,), e; ``None`` for all formats but PQR. Formal charges are not read.
+    #[getter]
+    fn charges<'py>(&self, py: Python<'py>) -> PyResult<Option<Bound<'py, PyAny>>> {
+        if self.atoms.structure.charge.is_empty() {
+            return Ok(None);
+        }
+        self.column(py, &self.columns.charges, |atoms| {
+            Ok(ColumnData::from_numbers(atoms.rows(|structure, i| structure.charge[i])))
         })
         .map(Some)
     }

@@ -12,8 +12,8 @@ use pyo3::types::PyDict;
 
 use crate::error::Failure;
 use crate::mesh::PyMesh;
-use crate::parameters::{self, Pairs, pairs, selection_of};
-use crate::source::{Atoms, Content, Source};
+use crate::parameters::{self, Pairs, pairs};
+use crate::source::{Content, Loaded, Source};
 use crate::work;
 
 /// Parameter that is true by default.
@@ -82,8 +82,10 @@ pub(crate) fn surface(
         // A compressed mesh has no columns. It is compressed when it is saved.
         let compress = job.request.options.compress;
         let quantized = if compress == Compress::Meshopt { Compress::Quantize } else { compress };
-        let (atoms, product, _) = job.run(|options| options.compress = quantized, control, tracker)?;
-        PyMesh::new(product, compress == Compress::Meshopt, &atoms, control)
+        let (loaded, product, options) = job.run(|options| options.compress = quantized, control, tracker)?;
+        let has_atoms = product.mesh.atom_ids.is_some();
+        let atoms = has_atoms.then(|| loaded.select(&options.selection, Pairs::new(), control)).transpose()?;
+        PyMesh::new(product, compress == Compress::Meshopt, atoms.as_deref(), control)
     })
 }
 
@@ -91,7 +93,6 @@ pub(crate) fn surface(
 pub(crate) struct Job {
     source: Source,
     pub(crate) request: Request,
-    selection: Pairs,
     map: Option<Content>,
 }
 
@@ -100,9 +101,8 @@ impl Job {
     pub(crate) fn new(source: Source, given: Pairs, map: Option<&Bound<'_, PyAny>>, format: Format) -> PyResult<Self> {
         let content = |map| Content::of(map)?.ok_or_else(|| PyTypeError::new_err("map must be a path or bytes"));
         let map = map.map(content).transpose()?;
-        let selection = selection_of(&given);
         let request = parameters::parse(&source, given, format)?;
-        Ok(Self { source, request, selection, map })
+        Ok(Self { source, request, map })
     }
 
     /// Reads the source and computes the mesh, after `adjust` has changed the options. Returns the options as well.
@@ -111,8 +111,8 @@ impl Job {
         adjust: impl FnOnce(&mut Options),
         control: &Control<'_>,
         tracker: &Tracker,
-    ) -> Result<(Arc<Atoms>, Product, Options), Failure> {
-        let Self { source, request: Request { mut options, strict, .. }, selection, map } = self;
+    ) -> Result<(Loaded, Product, Options), Failure> {
+        let Self { source, request: Request { mut options, strict, .. }, map } = self;
         let limits = JobLimits::default();
         adjust(&mut options);
         if let Some(map) = map {
@@ -121,13 +121,13 @@ impl Job {
         }
         options.check(&limits)?;
         let is_spheres = source.is_spheres();
-        let atoms = source.load(&options.selection, selection, strict, control, tracker)?;
+        let loaded = source.load(strict, control, tracker)?;
         let choice = Choice { backend: &CpuBackend::default(), reason: REASON };
-        let read = |_: &Control<'_>| Ok(Arc::clone(&atoms.structure));
+        let read = |_: &Control<'_>| Ok(Arc::clone(loaded.structure()));
         let mut product = run_with(read, &options, &limits, &choice, control, tracker, None)?;
         if is_spheres {
             (product.report.source_format, product.report.radii) = ("arrays", "radii of the caller");
         }
-        Ok((atoms, product, options))
+        Ok((loaded, product, options))
     }
 }

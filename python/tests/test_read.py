@@ -74,6 +74,14 @@ def test_formats_without_b_factors_have_none():
     assert molmesh.read(b"1\n\nC 0 0 0\n").b_factors is None
 
 
+def test_charges_are_those_of_pqr():
+    text = b"ATOM 1 N ALA 1 0 0 0 -0.4157 1.824\nHETATM 2 ZN ZN 2 9 0 0 2 1.1\nATOM 3 CA ALA 1 1.5 0 0 0.0337 1.908\n"
+    structure = molmesh.read(text)
+    assert structure.charges.dtype == np.float32 and np.allclose(structure.charges, [-0.4157, 0.0337])
+    assert molmesh.read(text, select="all").charges.tolist()[1] == 2
+    assert molmesh.read(PDB).charges is None and molmesh.read(CIF).charges is None
+
+
 def test_an_assembly_has_the_atoms_of_all_copies():
     structure = molmesh.read(ASSEMBLY, assembly=1)
     assert list(structure.names) == ["N", "CA", "C"] * 2

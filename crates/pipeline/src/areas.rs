@@ -177,14 +177,30 @@ pub fn measure_selection(
 ) -> Result<MeasuredSelection, JobError> {
     let LoadedStructure { selected, spheres, .. } =
         load(|_| Ok(structure), options, read, &WorkScope::new(&StageClock::new(&()), control))?;
+    let (measures, areas) = measure_selected(structure, &selected, &spheres, options, surface, control)?;
+    Ok(MeasuredSelection { left_out: selected.left_out, measures, areas })
+}
+
+/// Measures `spheres`, those of the `selected` atoms, without a mesh.
+///
+/// # Errors
+/// Returns the errors of [`super::run`] before meshing.
+pub fn measure_selected(
+    structure: &Structure,
+    selected: &Selected,
+    spheres: &Spheres,
+    options: &Options,
+    limits: &SurfaceLimits,
+    control: &Control<'_>,
+) -> Result<(SelectionMeasures, AtomAreas), JobError> {
     let (measures, areas) = if let Some(interface) = &options.interface {
-        let (report, areas) = interface.measure(structure, &selected, &spheres, options, surface, control)?;
+        let (report, areas) = interface.measure(structure, selected, spheres, options, limits, control)?;
         (SelectionMeasures::Interface(report), areas)
     } else {
-        let (report, areas) = whole(structure, &selected, &spheres, options, surface, control)?;
+        let (report, areas) = whole(structure, selected, spheres, options, limits, control)?;
         (SelectionMeasures::Exact(report), areas)
     };
-    Ok(MeasuredSelection { left_out: selected.left_out, measures, areas })
+    Ok((measures, areas))
 }
 
 /// Measures `spheres`, those of the `selected` atoms.

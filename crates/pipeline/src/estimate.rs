@@ -170,8 +170,11 @@ pub(super) fn check_memory(plan: &MeshPlan<'_>, options: &Options, control: &Con
     let vertices = n_vertices(plan.meshing.spheres.area(params), params.resolution);
     let most = params.mesh_bytes(vertices, vertices.saturating_mul(2)).saturating_add(attributes(vertices));
     // A surface before its cut has at most the same size, besides its atom indices.
-    let most =
-        if plan.meshing.cut.is_some() { most.saturating_mul(2).saturating_add(ID_BYTES * vertices) } else { most };
+    let most = if plan.meshing.cut.is_some() {
+        most.saturating_mul(2).saturating_add(ID_BYTES.saturating_mul(vertices))
+    } else {
+        most
+    };
     if memory.check(most).is_ok() {
         return Ok(());
     }
@@ -259,11 +262,11 @@ impl MeshPlan<'_> {
         }
         let [whole_area, area] = self.areas(COARSE_FACTOR * h, control)?;
         let [whole_vertices, vertices] = [whole_area, area].map(|area| n_vertices(area, h));
-        let triangles = 2 * vertices;
+        let triangles = vertices.saturating_mul(2);
         let bytes = params.mesh_bytes(vertices, triangles);
         // Limits count parts before quantizing, and a surface before its cut.
         let counted = if lattices.len() > 1 { &self.unquantized() } else { params };
-        let in_memory = counted.mesh_bytes(whole_vertices, 2 * whole_vertices);
+        let in_memory = counted.mesh_bytes(whole_vertices, whole_vertices.saturating_mul(2));
         if in_memory > limits.max_mesh_bytes {
             return Err(scan::too_large(in_memory, h, limits.max_mesh_bytes));
         }
@@ -315,7 +318,7 @@ impl MeshPlan<'_> {
 #[cfg(test)]
 mod tests {
     use molmesh_structure::{ReadLimits, read_with};
-    use molmesh_surface::{CpuBackend, Exceeded, SurfaceLimits};
+    use molmesh_surface::{CpuBackend, Exceeded, Spheres, SurfaceLimits};
 
     use super::*;
     use crate::{params, run};
@@ -375,6 +378,21 @@ mod tests {
         assert_eq!(most(least - 1), Err(error.error()));
         let small = SurfaceLimits { max_grid_points: 50_000, ..SurfaceLimits::default() };
         assert!(search("4", small).unwrap_err().exceeded(Limit::PocketPoints).is_some());
+    }
+
+    #[test]
+    fn sizes_of_huge_spheres_do_not_overflow() {
+        let (backend, limits) = (CpuBackend::new(None).unwrap(), SurfaceLimits::default());
+        let spheres = Spheres::new(vec![0.0], vec![0.0], vec![0.0], vec![1e9]).unwrap();
+        let params = SurfaceParams { resolution: 0.05, ..SurfaceParams::default() };
+        let quality = TriangleQuality::Standard;
+        let meshing =
+            Meshing { backend: &backend, spheres: &spheres, parts: None, cut: None, quality, limits: &limits };
+        let plan = MeshPlan { meshing: &meshing, params: &params, compress: Compress::None };
+        assert_eq!(n_vertices(spheres.area(&params), params.resolution), u64::MAX);
+        assert_eq!(params.mesh_bytes(u64::MAX, u64::MAX), u64::MAX);
+        // Without a limit, any size is accepted.
+        check_memory(&plan, &Options::default(), &Control::default()).unwrap();
     }
 
     #[test]

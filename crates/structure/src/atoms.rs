@@ -20,8 +20,8 @@ const ROW_BYTES: usize = 320;
 /// Memory of a model in the set and in the list of models, bytes.
 const MODEL_BYTES: usize = 32;
 
-/// Atoms of all models of a file, in file order. All columns have the same length, except that `label_chain` and
-/// `radius` may be empty. An atom takes 62 bytes, and 4 more with a radius.
+/// Atoms of all models of a file, in file order. All columns have the same length, except that `label_chain`,
+/// `radius` and `charge` may be empty. An atom takes 62 bytes, and 8 more with a radius and a charge.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Structure {
     /// Format of the source file.
@@ -60,6 +60,8 @@ pub struct Structure {
     pub b_factor: Vec<f32>,
     /// Radii in the file, Å; empty if it has none. Atoms of radius 0 are virtual sites.
     pub radius: Vec<f32>,
+    /// Charges in the file, e; empty for all formats but PQR.
+    pub charge: Vec<f32>,
     /// Model numbers.
     pub model: Vec<i32>,
     /// True for HETATM records.
@@ -363,6 +365,7 @@ impl Columns {
             occupancy: self.occupancy,
             b_factor: self.b_factor,
             radius: source.radii,
+            charge: source.charges,
             model: self.model,
             hetero: self.hetero,
             kind: self.kind,

@@ -3,7 +3,7 @@
 //! A line is `recordName serial atomName residueName [chainID] residueNumber X Y Z charge radius`. Supported
 //! deviations: a serial number that touches the record name (`HETATM10000`), a chain that touches the residue number
 //! (`A1000`), and fields that touch each other in the columns of PDB up to the coordinates. Serial numbers are ignored.
-//! Radii replace those of the table. Charges are only checked.
+//! Radii replace those of the table.
 
 use std::collections::HashMap;
 use std::ops::Range;
@@ -228,7 +228,7 @@ fn decimals(field: &[u8]) -> usize {
 pub(super) fn read(text: &[u8], reading: &Reading<'_>) -> Result<Structure, StructureError> {
     let expected = text.len() / BYTES_PER_LINE + 1;
     let mut file = Pqr { rows: Rows::new(reading, expected), guesses: HashMap::new(), model: 1 };
-    let (mut radii, mut marks) = (Vec::new(), Vec::new());
+    let (mut radii, mut charges, mut marks) = (Vec::new(), Vec::new(), Vec::new());
     for line in TextLines::new(text) {
         file.rows.count_line()?;
         let fields = Fields::split(text, line);
@@ -247,18 +247,23 @@ pub(super) fn read(text: &[u8], reading: &Reading<'_>) -> Result<Structure, Stru
         };
         // The final number follows from all parts. Until then, atoms of different parts may have the same position.
         file.model = i32::try_from(marks.len()).unwrap_or(i32::MAX);
-        let (atom, radius) = file.atom(text, &fields, hetero, first).map_err(|fault| fault.locate(text))?;
+        let (atom, charge, radius) = file.atom(text, &fields, hetero, first).map_err(|fault| fault.locate(text))?;
         file.rows.push(&atom)?;
         if radii.len() == radii.capacity() {
             let more = if radii.is_empty() { expected } else { radii.len() / 2 + 1024 };
-            let needed = (size_of::<f32>() * more) as u64;
+            let needed = (2 * size_of::<f32>() * more) as u64;
             reading.keep(needed)?;
-            radii.try_reserve_exact(more).map_err(|_refused| OutOfMemory::System { needed })?;
+            let reserve = |column: &mut Vec<f32>| column.try_reserve_exact(more);
+            [&mut radii, &mut charges]
+                .into_iter()
+                .try_for_each(reserve)
+                .map_err(|_refused| OutOfMemory::System { needed })?;
         }
         radii.push(radius);
+        charges.push(charge);
     }
     models::number(&marks, file.rows.columns_mut());
-    file.rows.finish(SourceFields { radii, ..SourceFields::new(SourceFormat::Pqr) })
+    file.rows.finish(SourceFields { radii, charges, ..SourceFields::new(SourceFormat::Pqr) })
 }
 
 /// State of reading.
@@ -270,14 +275,14 @@ struct Pqr<'a> {
 }
 
 impl Pqr<'_> {
-    /// Reads an atom and its radius. `first` is the number of fields before its name.
+    /// Reads an atom, its charge and its radius. `first` is the number of fields before its name.
     fn atom(
         &mut self,
         text: &[u8],
         fields: &Fields<'_>,
         hetero: bool,
         first: usize,
-    ) -> Result<(Atom, f32), Box<Fault>> {
+    ) -> Result<(Atom, f32, f32), Box<Fault>> {
         let found = AtomFields::find(text, fields, first).ok_or_else(|| fields_fault(fields, first))?;
         let fault = |(start, end): (usize, usize), expected: String| Fault::token(text, start, end, expected);
         let (start, end) = found.number;
@@ -291,6 +296,8 @@ impl Pqr<'_> {
         }
         let radius = number::real(text, found.radius.0, found.radius.1).filter(|r| (0.0..=MAX_RADIUS).contains(r));
         let radius = radius.ok_or_else(|| fault(found.radius, format!("the radius in Å, from 0 to {MAX_RADIUS}")))?;
+        let charge = number::real(text, found.charge.0, found.charge.1);
+        let charge = charge.ok_or_else(|| fault(found.charge, "the charge in e".to_owned()))?;
         let tables = &mut self.rows.tables;
         let name = tables.name.intern(text, found.name.0, found.name.1);
         let residue = tables.residue.intern(text, found.residue.0, found.residue.1);
@@ -303,7 +310,8 @@ impl Pqr<'_> {
         let element = stated.unwrap_or_else(|| *self.guesses.entry((name, residue)).or_insert_with(guess));
         let plain = self.rows.atom(position, element, name, self.model);
         let kind = if hetero { Kind::Ligand } else { Kind::Polymer };
-        Ok((Atom { residue, chain, residue_number, insertion_code, hetero, kind, ..plain }, single(radius)))
+        let atom = Atom { residue, chain, residue_number, insertion_code, hetero, kind, ..plain };
+        Ok((atom, single(charge), single(radius)))
     }
 }
 
@@ -368,6 +376,7 @@ mod tests {
         let s = parse(FILE).unwrap();
         assert_eq!((s.format, s.len()), (SourceFormat::Pqr, 6));
         assert_eq!(s.radius, [1.824, 0.0, 1.9, 1.1, 1.7, 2.0]);
+        assert_eq!(s.charge, [-0.3, 0.156, 0.1, 2.0, -0.8, 0.0]);
         assert_eq!(s.element, [7, 1, 6, 30, 8, 6]);
         assert_eq!((s.x[0], s.y[0], s.z[0]), (32.231, 15.281, -13.143));
         let texts = |column: &super::super::TextColumn| (0..6).map(|i| column.get(i).to_owned()).collect::<Vec<_>>();

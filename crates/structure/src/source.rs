@@ -44,6 +44,8 @@ pub(super) struct SourceFields {
     pub(super) unread: Unread,
     /// Radius of each atom, Å; empty if the file has none. The reader counts their memory for the structure.
     pub(super) radii: Vec<f32>,
+    /// Charge of each atom, e; empty if the file has none. Their memory is counted like that of the radii.
+    pub(super) charges: Vec<f32>,
     pub(super) warnings: Vec<String>,
 }
 
@@ -59,6 +61,7 @@ impl SourceFields {
             annotations: Annotations::default(),
             unread: Unread::default(),
             radii: Vec::new(),
+            charges: Vec::new(),
             warnings: Vec::new(),
         }
     }

@@ -354,11 +354,12 @@ impl Mesh {
         Self::bytes_for(self.n_vertices() as u64, self.n_triangles() as u64, self.quantized.is_some())
     }
 
-    /// Bytes of positions, normals and indices of a mesh with these numbers of vertices and triangles.
+    /// Bytes of positions, normals and indices of a mesh with these numbers of vertices and triangles; `u64::MAX` if
+    /// there are more.
     #[must_use]
     pub fn bytes_for(n_vertices: u64, n_triangles: u64, quantized: bool) -> u64 {
         let of_vertex = if quantized { 12 } else { 24 };
-        of_vertex * n_vertices + 12 * n_triangles
+        n_triangles.saturating_mul(12).saturating_add(n_vertices.saturating_mul(of_vertex))
     }
 }
 
