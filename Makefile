@@ -35,7 +35,7 @@ test: ## All checks and tests; installs what they need
 tools: ## Install what the tests need (a Python environment, Node packages, software Vulkan, Chromium)
 	@bash tests/tools/setup.sh
 
-web: ## Build the web page into web/dist, for the next build of the server; needs Node 20.19 or later
+web: ## Build the web page, for the next build of the server, and the package @molmesh/client; needs Node 20.19 or later
 	@sh web/build.sh
 
 # The service works without its web page, so a missing Node or network is reported but is not an error.
@@ -81,19 +81,17 @@ container: $(if $(BINARY),,release) ## Build and test the images (two to four mi
 tests: ## Run only the tests
 	@bash .ci/tests $(if $(PROFILE),$(PROFILE),dev)
 
-# With --workspace, dependencies have the same features as in the tests and are compiled once. The extension has the
-# name with which a wheel would contain it.
-PYTHON := target/test-tools/venv/bin/python
-python-test: ## Build the Python package with the profile of the tests, and run its tests; Linux only (after `make tools`)
-	$(CARGO) build --locked --workspace --lib --target-dir target
-	rm -rf target/python && mkdir -p target/python && cp -R python/molmesh target/python/
-	cp target/debug/lib_molmesh.so target/python/molmesh/_molmesh.abi3.so
-	PYTHONPATH=target/python PYTHONDONTWRITEBYTECODE=1 $(PYTHON) -m pytest -q -p no:cacheprovider python/tests
+# The environment has the wheel and what it requires only. Other packages of the tests are those of `make tools`.
+TOOLS := $(CURDIR)/target/test-tools/venv
+python-test: web-if-possible ## Build a wheel with the profile of the tests, install it into a fresh environment, and run its tests; Linux only (after `make tools`)
+	deploy/wheel.sh dev
+	rm -rf target/python/venv && $(TOOLS)/bin/python -m venv --without-pip target/python/venv
+	$(TOOLS)/bin/python -m pip --python target/python/venv/bin/python install -q --no-compile target/python/molmesh-*.whl
+	PYTHONPATH="$$(echo $(TOOLS)/lib/python3*/site-packages)" PYTHONDONTWRITEBYTECODE=1 \
+		target/python/venv/bin/python -m pytest -q -p no:cacheprovider python/tests
 
-# Without patchelf, maturin tests which manylinux tag the extension complies with, and uses it.
-wheel: ## Build a wheel of the Python package for this machine into dist/; PROFILE=fast-build takes less time
-	PATH="$(CURDIR)/target/test-tools/venv/bin:$$PATH" maturin build --locked --manifest-path python/Cargo.toml \
-		--profile $(or $(PROFILE),release) --strip --out dist
+wheel: web-if-possible ## Build a wheel with the Python package and the command molmesh into dist/ (after `make tools`); PROFILE=fast-build takes less time
+	deploy/wheel.sh $(or $(PROFILE),release)
 
 # The wrapper compiles the libraries with counters that guide the fuzzer. With --workspace, dependencies have the same
 # features as in tests.
@@ -148,4 +146,4 @@ static-if-possible:
 
 clean: ## Remove all build output
 	$(CARGO) clean
-	rm -rf dist web/dist
+	rm -rf dist web/dist web/client/dist

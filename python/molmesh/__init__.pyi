@@ -1,15 +1,37 @@
-from collections.abc import Callable, Sequence
+from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Sequence
 from os import PathLike
-from typing import Any, TypedDict, final, overload
+from pathlib import Path
+from types import TracebackType
+from typing import Any, NamedTuple, TypedDict, final, overload
 
 from numpy import float32, float64, str_, uint8, uint32, void
 from numpy.typing import ArrayLike, NDArray
 from trimesh import Trimesh
-from typing_extensions import Required, Unpack
+from typing_extensions import Required, Self, Unpack
 
-__all__ = ["PARAMETERS", "Error", "Mesh", "Structure", "__version__", "areas", "read", "render", "surface"]
+__all__ = [
+    "PARAMETERS",
+    "AsyncClient",
+    "AsyncJob",
+    "Cavity",
+    "Client",
+    "Error",
+    "Job",
+    "MapResult",
+    "Mesh",
+    "Pocket",
+    "Structure",
+    "__version__",
+    "areas",
+    "cavities",
+    "pockets",
+    "read",
+    "render",
+    "surface",
+]
 
-_File = str | PathLike[str] | bytes | bytearray | memoryview
+_Path = str | PathLike[str]
+_File = _Path | bytes | bytearray | memoryview
 _Progress = Callable[[str, float], object] | None
 
 __version__: str
@@ -40,6 +62,14 @@ class _Areas(_Selection, total=False):
     radius_scale: float | None
     radius_offset: float | None
     interface: str | Sequence[str] | None
+
+class _Cavities(_Selection, total=False):
+    probe: float | None
+    radius_scale: float | None
+    radius_offset: float | None
+
+class _Pockets(_Cavities, total=False):
+    pocket_probe: float | None
 
 class _Surface(_Checked, total=False):
     preset: str | None
@@ -108,6 +138,8 @@ class Structure:
     @property
     def b_factors(self) -> NDArray[float32] | None: ...
     @property
+    def charges(self) -> NDArray[float32] | None: ...
+    @property
     def indices(self) -> NDArray[uint32]: ...
     @property
     def left_out(self) -> dict[str, Any]: ...
@@ -146,6 +178,40 @@ class Mesh:
     def to_trimesh(self) -> Trimesh: ...
     def _repr_png_(self) -> bytes | None: ...
 
+@final
+class Cavity:
+    @property
+    def center(self) -> tuple[float, float, float]: ...
+    @property
+    def radius(self) -> float: ...
+    @property
+    def volume(self) -> float: ...
+    @property
+    def area(self) -> float: ...
+    @property
+    def accessible_volume(self) -> float: ...
+    @property
+    def accessible_area(self) -> float: ...
+    @property
+    def opening_radius(self) -> float: ...
+    @property
+    def atoms(self) -> NDArray[uint32]: ...
+
+@final
+class Pocket:
+    @property
+    def center(self) -> tuple[float, float, float]: ...
+    @property
+    def volume(self) -> float: ...
+    @property
+    def area(self) -> float: ...
+    @property
+    def depth(self) -> float: ...
+    @property
+    def openings(self) -> int: ...
+    @property
+    def atoms(self) -> NDArray[uint32]: ...
+
 def read(source: _File, *, progress: _Progress = None, **parameters: Unpack[_Checked]) -> Structure: ...
 @overload
 def surface(
@@ -174,6 +240,22 @@ def areas(
     source: ArrayLike, radii: ArrayLike, *, progress: _Progress = None, **parameters: Unpack[_Areas]
 ) -> dict[str, NDArray[Any]]: ...
 @overload
+def cavities(
+    source: _File | Structure, radii: None = None, *, progress: _Progress = None, **parameters: Unpack[_Cavities]
+) -> list[Cavity]: ...
+@overload
+def cavities(
+    source: ArrayLike, radii: ArrayLike, *, progress: _Progress = None, **parameters: Unpack[_Cavities]
+) -> list[Cavity]: ...
+@overload
+def pockets(
+    source: _File | Structure, radii: None = None, *, progress: _Progress = None, **parameters: Unpack[_Pockets]
+) -> list[Pocket]: ...
+@overload
+def pockets(
+    source: ArrayLike, radii: ArrayLike, *, progress: _Progress = None, **parameters: Unpack[_Pockets]
+) -> list[Pocket]: ...
+@overload
 def render(
     source: Mesh,
     radii: None = None,
@@ -200,3 +282,144 @@ def render(
     progress: _Progress = None,
     **parameters: Unpack[_Render],
 ) -> bytes: ...
+
+class MapResult(NamedTuple):
+    source: _File
+    content: bytes | Path | None = None
+    error: Exception | None = None
+
+class Job:
+    @property
+    def id(self) -> str: ...
+    def status(self) -> dict[str, Any]: ...
+    def wait(self, timeout: float | None = None) -> dict[str, Any]: ...
+    @overload
+    def result(self, timeout: float | None = None, *, save: None = None) -> bytes: ...
+    @overload
+    def result(self, timeout: float | None = None, *, save: _Path) -> Path: ...
+    def cancel(self) -> dict[str, Any]: ...
+
+class AsyncJob:
+    @property
+    def id(self) -> str: ...
+    async def status(self) -> dict[str, Any]: ...
+    async def wait(self, timeout: float | None = None) -> dict[str, Any]: ...
+    @overload
+    async def result(self, timeout: float | None = None, *, save: None = None) -> bytes: ...
+    @overload
+    async def result(self, timeout: float | None = None, *, save: _Path) -> Path: ...
+    async def cancel(self) -> dict[str, Any]: ...
+
+class Client:
+    def __init__(self, url: str, key: str | None = None, *, timeout: float = 300.0) -> None: ...
+    def __enter__(self) -> Self: ...
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None, /
+    ) -> None: ...
+    def close(self) -> None: ...
+    def capabilities(self) -> dict[str, Any]: ...
+    def upload(self, file: _File) -> str: ...
+    @overload
+    def mesh(
+        self,
+        source: _File,
+        *,
+        format: str | None = None,
+        save: None = None,
+        map: _File | None = None,
+        **parameters: Unpack[_Render],
+    ) -> bytes: ...
+    @overload
+    def mesh(
+        self,
+        source: _File,
+        *,
+        format: str | None = None,
+        save: _Path,
+        map: _File | None = None,
+        **parameters: Unpack[_Render],
+    ) -> Path: ...
+    @overload
+    def picture(
+        self, source: _File, *, save: None = None, map: _File | None = None, **parameters: Unpack[_Render]
+    ) -> bytes: ...
+    @overload
+    def picture(
+        self, source: _File, *, save: _Path, map: _File | None = None, **parameters: Unpack[_Render]
+    ) -> Path: ...
+    def report(self, source: _File, *, map: _File | None = None, **parameters: Unpack[_Render]) -> dict[str, Any]: ...
+    def estimate(self, source: _File, *, map: _File | None = None, **parameters: Unpack[_Render]) -> dict[str, Any]: ...
+    def areas(self, source: _File, **parameters: Unpack[_Areas]) -> dict[str, NDArray[Any]]: ...
+    def submit(
+        self, source: _File, *, format: str = "glb", map: _File | None = None, **parameters: Unpack[_Render]
+    ) -> Job: ...
+    def job(self, id: str) -> Job: ...
+    def map(
+        self,
+        files: Iterable[_File],
+        *,
+        format: str = "glb",
+        save: _Path | None = None,
+        concurrency: int | None = None,
+        progress: bool = False,
+        **parameters: Unpack[_Render],
+    ) -> Iterator[MapResult]: ...
+
+class AsyncClient:
+    def __init__(self, url: str, key: str | None = None, *, timeout: float = 300.0) -> None: ...
+    async def __aenter__(self) -> Self: ...
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None, /
+    ) -> None: ...
+    async def aclose(self) -> None: ...
+    async def capabilities(self) -> dict[str, Any]: ...
+    async def upload(self, file: _File) -> str: ...
+    @overload
+    async def mesh(
+        self,
+        source: _File,
+        *,
+        format: str | None = None,
+        save: None = None,
+        map: _File | None = None,
+        **parameters: Unpack[_Render],
+    ) -> bytes: ...
+    @overload
+    async def mesh(
+        self,
+        source: _File,
+        *,
+        format: str | None = None,
+        save: _Path,
+        map: _File | None = None,
+        **parameters: Unpack[_Render],
+    ) -> Path: ...
+    @overload
+    async def picture(
+        self, source: _File, *, save: None = None, map: _File | None = None, **parameters: Unpack[_Render]
+    ) -> bytes: ...
+    @overload
+    async def picture(
+        self, source: _File, *, save: _Path, map: _File | None = None, **parameters: Unpack[_Render]
+    ) -> Path: ...
+    async def report(
+        self, source: _File, *, map: _File | None = None, **parameters: Unpack[_Render]
+    ) -> dict[str, Any]: ...
+    async def estimate(
+        self, source: _File, *, map: _File | None = None, **parameters: Unpack[_Render]
+    ) -> dict[str, Any]: ...
+    async def areas(self, source: _File, **parameters: Unpack[_Areas]) -> dict[str, NDArray[Any]]: ...
+    async def submit(
+        self, source: _File, *, format: str = "glb", map: _File | None = None, **parameters: Unpack[_Render]
+    ) -> AsyncJob: ...
+    def job(self, id: str) -> AsyncJob: ...
+    def map(
+        self,
+        files: Iterable[_File],
+        *,
+        format: str = "glb",
+        save: _Path | None = None,
+        concurrency: int | None = None,
+        progress: bool = False,
+        **parameters: Unpack[_Render],
+    ) -> AsyncIterator[MapResult]: ...
