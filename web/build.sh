@@ -1,5 +1,6 @@
 #!/bin/sh
-# Builds the web page into web/dist. Does nothing if that is up to date, and prints only when it builds or fails.
+# Builds the web page into web/dist and the package @molmesh/client into web/client/dist. Does nothing if they are up to
+# date, and prints only when it builds or fails.
 set -eu
 cd "$(CDPATH='' cd -- "$(dirname -- "$0")" && pwd)"
 
@@ -36,9 +37,11 @@ if [ "$(cat node_modules/.stamp 2>/dev/null)" != "$stamp" ]; then
 fi
 
 # shellcheck disable=SC2046 # source file names contain no blanks
-stamp=$(digest $(find src public licences index.html vite.config.js pack.mjs tsconfig.json package-lock.json -type f | LC_ALL=C sort))
-if [ "$(cat dist/.stamp 2>/dev/null)" != "$stamp" ]; then
-    echo "building the web page into web/dist" >&2
+stamp=$(digest $(find src public licences index.html vite.config.js pack.mjs tsconfig.json package-lock.json client ../openapi.yaml ../LICENSE-* \
+    -type f ! -path 'client/dist/*' ! -path 'client/test/*' | LC_ALL=C sort))
+if [ "$(cat dist/.stamp 2>/dev/null)" != "$stamp" ] || [ ! -d client/dist/viewer ]; then
+    echo "building the web page into web/dist, and the package @molmesh/client into web/client/dist" >&2
+    rm -rf client/dist
     log=$(mktemp)
     npm run --silent build >"$log" 2>&1 || { cat "$log" >&2; rm -f "$log"; fail "the build of the web page failed"; }
     rm -f "$log"

@@ -1,5 +1,6 @@
-// Finishes the build: adds the licences of bundled packages and compresses every file with gzip for embedding.
-import { readFileSync, readdirSync, rmSync, writeFileSync } from "node:fs";
+// Finishes the build: adds the licences of bundled packages, copies the component into the package @molmesh/client, and
+// compresses every file with gzip for embedding.
+import { cpSync, readFileSync, readdirSync, rmSync, writeFileSync } from "node:fs";
 import { gzipSync } from "node:zlib";
 
 const here = new URL("./", import.meta.url);
@@ -16,6 +17,14 @@ const texts = bundled.map(([name, kept, theirs]) => {
   return `${name}\n${"-".repeat(100)}\n${text.trim()}\n`;
 });
 writeFileSync(new URL("assets/licences.txt", dist), `The viewer contains third-party software:\n\n${texts.join("\n\n")}`);
+
+// The component imports all scripts except those of the page.
+const client = new URL("client/dist/", here);
+cpSync(dist, new URL("viewer/", client), {
+  recursive: true,
+  filter: (path) => !/\.[^/]*$/.test(path) || /molmesh-viewer\.js$|\/assets\/(?!index-)[^/]*\.js$|licences\.txt$/.test(path),
+});
+for (const name of ["LICENSE-APACHE", "LICENSE-MIT"]) cpSync(new URL(`../${name}`, here), new URL(name, client));
 
 let [plain, packed] = [0, 0];
 for (const entry of readdirSync(dist, { recursive: true, withFileTypes: true })) {

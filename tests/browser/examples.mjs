@@ -1,15 +1,32 @@
-// The pages of examples/, unchanged except for the address of the service.
+// The pages of examples/ and the code of docs/start/web.md and docs/api/clients.md, unchanged except for the address of
+// the service.
 import http from "node:http";
 import { readFileSync } from "node:fs";
 import path from "node:path";
 import { assert, browser, fetchBytes, glb, open, picture, run, silhouette, MODULES, ROOT, SERVICE_URL, TIMEOUT_MS } from "./lib.mjs";
+
+/** Returns the blocks of a page of docs/ in a language. */
+const blocks = (page, language) => [...readFileSync(path.join(ROOT, "docs", page), "utf8").matchAll(new RegExp("^```" + language + "\\n(.*?)^```", "gms"))].map(([, code]) => code);
+// The scripts use a loader and a file of the user. Those of clients.md continue each other.
+const codes = [...blocks("start/web.md", "js"), ...blocks("start/web.md", "ts"), blocks("api/clients.md", "js").join("")];
+const scripts = codes.map((code) => `<script type="module">${code}\nfinished += 1;</script>`);
+const pages = {
+  "/first.html": blocks("start/web.md", "html")[0],
+  "/scripts.html": `<!doctype html><title>scripts</title><script type="importmap">{ "imports": {
+      "three": "/node_modules/three/build/three.module.js", "three/addons/": "/node_modules/three/examples/jsm/", "@molmesh/client": "/client/index.js", "@molmesh/client/viewer": "/client/viewer/molmesh-viewer.js"
+    } }</script>
+    <script>var finished = 0, file = new Blob([${JSON.stringify(readFileSync(path.join(ROOT, "samples/1crn.cif"), "utf8"))}]);</script>
+    <script type="module">import { GLTFLoader } from "three/addons/loaders/GLTFLoader.js"; window.GLTFLoader = GLTFLoader;</script>${scripts.join("")}`,
+};
 
 /** Serves the examples from another origin than the service. */
 const server = http.createServer((request, reply) => {
   const name = new URL(request.url, "http://x").pathname;
   try {
     const isModule = name.startsWith("/node_modules/");
-    const bytes = readFileSync(isModule ? path.join(MODULES, name.slice("/node_modules/".length)) : path.join(ROOT, "examples", name));
+    const folder = name.startsWith("/client/") ? "web/client/dist" : "examples";
+    const file = isModule ? path.join(MODULES, name.slice("/node_modules/".length)) : path.join(ROOT, folder, name.replace("/client/", "/"));
+    const bytes = pages[name] ?? readFileSync(file);
     const type = name.endsWith(".html") ? "text/html; charset=utf-8" : "text/javascript";
     reply.writeHead(200, { "content-type": type });
     reply.end(isModule ? bytes : bytes.toString().replaceAll("http://127.0.0.1:8080", SERVICE_URL));
@@ -51,6 +68,23 @@ await run({
     assertNoErrors(page);
     await page.evaluate(() => (document.querySelector("#surface").src = "/nothing.glb"));
     await page.locator("#message", { hasText: "404" }).waitFor({ timeout: TIMEOUT_MS });
+    await page.context().close();
+  },
+
+  "the code of the documentation runs": async () => {
+    assert.ok(scripts.length >= 6, `${scripts.length} blocks`);
+    const first = await open(chromium, { url: `${origin}/first.html` });
+    await first.waitForFunction(() => document.querySelector("molmesh-viewer").shadowRoot?.querySelector(".legend")?.textContent, null, { timeout: TIMEOUT_MS });
+    const shape = silhouette(await picture(first, "molmesh-viewer"));
+    assert.ok(shape.share > 0.05, JSON.stringify(shape));
+    assertNoErrors(first);
+    await first.context().close();
+    const lines = [];
+    const page = await open(chromium, { before: (page) => page.on("console", (message) => lines.push(message.text())), url: `${origin}/scripts.html` });
+    await page.waitForFunction((n) => window.finished === n, scripts.length, { timeout: TIMEOUT_MS });
+    assert.ok(lines.some((line) => line.startsWith(`${triangles} triangles`)) && lines.some((line) => /^\d+ is the atom of vertex 0$/.test(line)), lines.join("; "));
+    // The last script of clients.md shows a rejected request.
+    assert.deepEqual(page.errors.filter((line) => !line.startsWith("warning") && !line.includes("status of 422")), []);
     await page.context().close();
   },
 

@@ -1,15 +1,15 @@
 // Meshes a file and follows a job with a client that @hey-api/openapi-ts generated, for tests/http/openapi_clients.rs.
 // Usage: URL FILE. The generated code parses types that it does not know, such as model/gltf-binary, as JSON: hence
-// `parseAs`.
+// `Accept`.
 import { readFileSync } from "node:fs";
 import { createMesh, createReport, showJob, showResult } from "./client";
 import { client } from "./client/client.gen";
 
 async function main(baseUrl: string, path: string): Promise<void> {
-  client.setConfig({ baseUrl });
+  client.setConfig({ baseUrl, headers: { Accept: "application/octet-stream, */*;q=0.5" } });
   const body = new Blob([readFileSync(path)]);
 
-  const mesh = await createMesh({ body, parseAs: "blob", throwOnError: true });
+  const mesh = await createMesh({ body, throwOnError: true });
   if (!(mesh.data instanceof Blob)) throw new Error("not a file");
   if ((await mesh.data.slice(0, 4).text()) !== "glTF") throw new Error(await mesh.data.text());
 
@@ -21,7 +21,7 @@ async function main(baseUrl: string, path: string): Promise<void> {
     job = (await showJob({ path: { id: job.jobID }, query: { wait: 20 }, throwOnError: true })).data;
   }
   if (!job.result) throw new Error(JSON.stringify(job));
-  const result = await showResult({ path: { file: job.result }, parseAs: "blob", throwOnError: true });
+  const result = await showResult({ path: { file: job.result }, throwOnError: true });
   if (result.data.size >= mesh.data.size) throw new Error(`${result.data.size} bytes`);
 
   const report = await createReport({ body, throwOnError: true });

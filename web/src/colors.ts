@@ -1,7 +1,7 @@
 /** Colours of the shown surface: applies a colour scheme, and passes on its legend. */
 
 import { atomColors, colorsPath, type Legend } from "./api/colors";
-import type { Client } from "./api/client";
+import type { Client } from "../client/src/client";
 import type { Choices } from "./request";
 import { palette } from "./scene/material";
 import type { Viewer } from "./scene/viewer";

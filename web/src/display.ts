@@ -1,6 +1,6 @@
 /** Display of the surface apart from parameters: sticks of ligands, transparency, hidden parts, view. */
 
-import type { Client } from "./api/client";
+import type { Client } from "../client/src/client";
 import type { Source } from "./api/structures";
 import { Ligands } from "./ligands";
 import type { Choices } from "./request";

@@ -1,9 +1,9 @@
 /** Downloads of the shown surface in every format, identical to the response of the API. */
 
-import type { Client } from "./api/client";
-import { fetchFile } from "./api/jobs";
+import type { JobDocument } from "../client/dist/api";
+import type { Client } from "../client/src/client";
 import type { Source } from "./api/structures";
-import { type Choices, stem, surface } from "./request";
+import { type Choices, stem, surface, UNCACHED } from "./request";
 import { $, bytes, el } from "./ui/dom";
 
 export class Downloads {
@@ -29,9 +29,8 @@ export class Downloads {
     status.textContent = `Making the ${format.toUpperCase()}…`;
     try {
       const path = surface(wanted.source, format, wanted.choices);
-      const reply = await fetchFile(this.client, path, new AbortController().signal, ({ fraction }) => {
-        status.textContent = `Making the ${format.toUpperCase()}: ${Math.round(100 * fraction)} %`;
-      });
+      const onProgress = ({ fraction }: JobDocument) => (status.textContent = `Making the ${format.toUpperCase()}: ${Math.round(100 * fraction)} %`);
+      const reply = await this.client.file(path, { onProgress, init: UNCACHED });
       const blob = await reply.blob();
       const name = /filename="([^"]+)"/.exec(reply.headers.get("content-disposition") ?? "")?.[1] ?? `${stem(wanted.source)}.${format}`;
       const url = URL.createObjectURL(blob);

@@ -1,9 +1,11 @@
 /** `<molmesh-viewer src="…/surface.glb">`: a surface in any page. */
 
 import { bytesOf } from "./api/bytes";
-import { Client } from "./api/client";
-import { fetchFile, type Job } from "./api/jobs";
-import { asProblem, Problem } from "./api/problem";
+import type { JobDocument } from "../client/dist/api";
+import { Client } from "../client/src/client";
+import { Problem } from "../client/src/problem";
+import type { MolmeshViewerAttributes, MolmeshViewerEvents } from "../client/src/viewer";
+import { asProblem } from "./api/problem";
 import { Colors } from "./colors";
 import { tileFetcher, type TilesetPaths, tilesetAt } from "./large";
 import { Ligands } from "./ligands";
@@ -12,7 +14,9 @@ import { contextOf, transparencyOf } from "./scene/context";
 import { Viewer } from "./scene/viewer";
 import { chooseScheme, fillSchemes, showLegend } from "./ui/legend";
 
-const ATTRIBUTES = ["src", "color", "scheme", "menu", "sticks", "transparency", "background", "turn", "alt"] as const;
+const ATTRIBUTES: Record<keyof MolmeshViewerAttributes, true> = {
+  src: true, alt: true, color: true, scheme: true, menu: true, sticks: true, transparency: true, background: true, turn: true,
+};
 
 const STYLE = `
 :host { display: block; position: relative; min-height: 12rem }
@@ -27,8 +31,8 @@ p { margin: 0; padding: 1rem; overflow-wrap: anywhere }
 `;
 
 export class MolmeshViewer extends HTMLElement {
-  static readonly observedAttributes: readonly string[] = ATTRIBUTES;
-  private readonly client = new Client();
+  static readonly observedAttributes: readonly string[] = Object.keys(ATTRIBUTES);
+  private readonly client = new Client(document.baseURI, { retries: 0 });
   private viewer: Viewer | null = null;
   private abort: AbortController | null = null;
   private readonly canvas = document.createElement("canvas");
@@ -88,7 +92,7 @@ export class MolmeshViewer extends HTMLElement {
     this.ligands = null;
   }
 
-  attributeChangedCallback(name: (typeof ATTRIBUTES)[number], before: string | null, after: string | null): void {
+  attributeChangedCallback(name: keyof MolmeshViewerAttributes, before: string | null, after: string | null): void {
     if (!this.viewer || before === after) return;
     if (name === "src") void this.load(after ?? "");
     else if (name === "scheme" || name === "sticks") this.paint();
@@ -109,9 +113,9 @@ export class MolmeshViewer extends HTMLElement {
     const { signal } = (this.abort = new AbortController());
     if (!src) return this.arrange("");
     try {
-      const progress = ({ status, stage, fraction }: Job) => this.tell("progress", { status, stage, fraction });
+      const onProgress = ({ status, stage, fraction }: JobDocument) => this.tell("molmesh-progress", { status, stage, fraction });
       const tileset = tilesetAt(src);
-      const reply = await fetchFile(this.client, tileset?.root ?? src, signal, progress, {});
+      const reply = await this.client.file(tileset?.root ?? src, { signal, onProgress });
       const loaded = await load(await bytesOf(reply));
       signal.throwIfAborted();
       // The canvas has a size only while it is visible.
@@ -121,7 +125,7 @@ export class MolmeshViewer extends HTMLElement {
       signal.throwIfAborted();
       if (tileset) void this.refine(tileset);
       if (this.hasAttribute("turn")) this.viewer?.turn(true);
-      this.tell("load", { report: loaded.extras });
+      this.tell("molmesh-load", { report: loaded.extras });
     } catch (error) {
       if (!signal.aborted) this.fail(error);
     }
@@ -130,7 +134,7 @@ export class MolmeshViewer extends HTMLElement {
   /** Shows the tiles of a tileset as the view needs them. */
   private async refine(tileset: TilesetPaths): Promise<void> {
     const failed = (error: unknown) => this.report(error);
-    await this.viewer?.refine(tileset.document, tileFetcher(this.client), (state) => this.tell("tiles", state), failed);
+    await this.viewer?.refine(tileset.document, tileFetcher(this.client), (state) => this.tell("molmesh-tiles", state), failed);
   }
 
   /** Shows the canvas, or, with the reason `failure`, the fallback. */
@@ -147,7 +151,7 @@ export class MolmeshViewer extends HTMLElement {
   private lost(lost: boolean): void {
     this.isLost = lost;
     this.arrange(this.failure);
-    this.tell(lost ? "contextlost" : "contextrestored", {});
+    this.tell(lost ? "molmesh-contextlost" : "molmesh-contextrestored", {});
   }
 
   private clicked(event: MouseEvent): void {
@@ -155,7 +159,7 @@ export class MolmeshViewer extends HTMLElement {
     const hit = this.viewer?.pick((2 * event.offsetX) / clientWidth - 1, 1 - (2 * event.offsetY) / clientHeight);
     const atom = hit && hit.atom >= 0 ? hit.atom : null;
     this.viewer?.mark("pinned", atom === null ? null : [atom, atom]);
-    this.tell("pick", { atom, point: hit?.point.toArray() ?? null });
+    this.tell("molmesh-pick", { atom, point: hit?.point.toArray() ?? null });
   }
 
   private pressed(event: KeyboardEvent): void {
@@ -195,7 +199,7 @@ export class MolmeshViewer extends HTMLElement {
   /** Reports an error; the surface stays visible. */
   private report(error: unknown): void {
     const { document } = asProblem(error);
-    this.tell("error", { message: document.detail ?? document.title, problem: error instanceof Problem ? document : null });
+    this.tell("molmesh-error", { message: document.detail ?? document.title, problem: error instanceof Problem ? document : null });
   }
 
   private fail(error: unknown): void {
@@ -203,11 +207,11 @@ export class MolmeshViewer extends HTMLElement {
     const words = [document.title, document.detail].filter(Boolean).join(": ");
     const message = this.src ? `${this.src}: ${words}` : words;
     this.arrange(message);
-    this.tell("error", { message, problem: error instanceof Problem ? document : null });
+    this.tell("molmesh-error", { message, problem: error instanceof Problem ? document : null });
   }
 
-  private tell(name: string, detail: unknown): void {
-    this.dispatchEvent(new CustomEvent(`molmesh-${name}`, { detail, bubbles: true }));
+  private tell<Name extends keyof MolmeshViewerEvents>(name: Name, detail: MolmeshViewerEvents[Name]["detail"]): void {
+    this.dispatchEvent(new CustomEvent(name, { detail, bubbles: true }));
   }
 }
 

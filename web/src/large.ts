@@ -1,6 +1,6 @@
 /** Surfaces that are too large for one file. They are shown in tiles, which are loaded as the view needs them. */
 
-import type { Client } from "./api/client";
+import type { Client } from "../client/src/client";
 import { asProblem } from "./api/problem";
 import type { Source } from "./api/structures";
 import { type Choices, query, surface } from "./request";

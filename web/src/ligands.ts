@@ -1,8 +1,8 @@
 /** Ligands of the shown structure as sticks, for the page and the component. */
 
 import { atomColors, colorsPath } from "./api/colors";
-import type { Client } from "./api/client";
-import { Problem } from "./api/problem";
+import type { Client } from "../client/src/client";
+import { Problem } from "../client/src/problem";
 import { positions } from "./api/structures";
 import { type Choices, query } from "./request";
 import { MAX_ATOMS, sticks } from "./scene/sticks";

@@ -1,13 +1,14 @@
 /** Entry point of the page: structure and parameters, the surface, and its report. */
 
-import { Client } from "./api/client";
-import { asProblem, Problem } from "./api/problem";
+import { Client } from "../client/src/client";
+import { Problem } from "../client/src/problem";
+import { asProblem } from "./api/problem";
 import { formatsOf, type OpenApi, parametersOf, schemesOf, tilesetParametersOf } from "./api/schema";
 import { theme } from "./ui/theme";
 import { Page } from "./page";
 import { $, show } from "./ui/dom";
 
-const client = new Client();
+const client = new Client(document.baseURI, { retries: 0 });
 const page = new Page(client);
 theme(() => page.stage.theme());
 

@@ -1,7 +1,7 @@
 /** Controller of the page: structures, parameters and meshes. */
 
-import type { Client } from "./api/client";
-import { asProblem, Problem } from "./api/problem";
+import { type Client, Problem } from "../client/src/index";
+import { asProblem } from "./api/problem";
 import type { Legend } from "./api/colors";
 import type { Parameter, Schemes } from "./api/schema";
 import { entry, type Source, stored, upload } from "./api/structures";

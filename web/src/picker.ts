@@ -1,6 +1,6 @@
 /** Atom selection: under the pointer, pinned by a click, or found by name. */
 
-import type { Client } from "./api/client";
+import type { Client } from "../client/src/client";
 import { type Atom, type Labels, labels, nameOf, type Source } from "./api/structures";
 import type { Viewer } from "./scene/viewer";
 import { $, el, show } from "./ui/dom";

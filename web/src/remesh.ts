@@ -1,13 +1,13 @@
 /** Queue of mesh requests. A new request cancels the running one, here and in the service. */
 
 import { bytesOf } from "./api/bytes";
-import type { Client } from "./api/client";
-import { fetchFile, type Progress } from "./api/jobs";
-import { Problem } from "./api/problem";
+import type { JobDocument } from "../client/dist/api";
+import type { Client } from "../client/src/client";
+import { Problem } from "../client/src/problem";
 import type { Source } from "./api/structures";
 import type { DisplayState } from "./display";
 import { isLarge, type TilesetPaths } from "./large";
-import type { Choices } from "./request";
+import { type Choices, UNCACHED } from "./request";
 
 export interface MeshRequest {
   source: Source;
@@ -43,7 +43,8 @@ export interface Listener {
   begin(request: MeshRequest): void;
   /** Returns the tileset of a surface that may be too large for one file; otherwise null. */
   tileset(request: MeshRequest): TilesetPaths | null;
-  progress: Progress;
+  /** Called with the state of the job of the running request. */
+  progress(job: JobDocument): void;
   /** Shows a received mesh. Later requests wait until it is shown. */
   show(delivery: Delivery): Promise<void>;
   failed(error: unknown, request: MeshRequest): void;
@@ -108,7 +109,8 @@ export class Remesher {
     const { request, abort } = mine;
     const isLatest = () => this.current === mine;
     try {
-      const fetching = (path: string) => fetchFile(this.client, path, abort.signal, (job) => isLatest() && this.listener.progress(job));
+      const onProgress = (job: JobDocument) => isLatest() && this.listener.progress(job);
+      const fetching = (path: string) => this.client.file(path, { signal: abort.signal, onProgress, init: UNCACHED });
       let tileset = request.preview === undefined ? this.listener.tileset(request) : null;
       let reply = tileset && (await fetching(tileset.root).catch(withoutTiles));
       // The number of atoms is known only now. The service has read them, so the whole surface takes little longer.

@@ -51,6 +51,9 @@ export function curl(source: Source, format: string, choices: Choices, origin: s
 /** The bundled structure. */
 export const SAMPLE = "sample.pdb";
 
+/** Keeps meshes out of the browser's cache: they are large and made in milliseconds. */
+export const UNCACHED: RequestInit = { cache: "no-store" };
+
 /** Returns a file name without an extension. */
 export function stem(source: Source): string {
   return (source.summary?.id ?? source.name).replaceAll(/[^\w.-]+/g, "_").replace(/\.(pdb|ent|cif|mmcif|bcif)?(\.gz|\.zst)?$/i, "").toLowerCase() || "surface";

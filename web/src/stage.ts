@@ -1,10 +1,9 @@
 /** Display of the surface: the WebGL viewer, or a picture from the service if WebGL is missing or lost. */
 
-import type { Client } from "./api/client";
-import { fetchFile } from "./api/jobs";
+import type { Client } from "../client/src/client";
 import { asProblem } from "./api/problem";
 import { tileFetcher, type TilesetPaths } from "./large";
-import { type Choices, surface } from "./request";
+import { type Choices, surface, UNCACHED } from "./request";
 import type { Source } from "./api/structures";
 import { load, type Loaded } from "./scene/load";
 import { contextOf } from "./scene/context";
@@ -160,7 +159,7 @@ export class Stage {
     const size = (side: number) => String(Math.max(64, Math.min(2048, Math.round(side * pixels))));
     const path = surface(source, "png", choices, { width: size(clientWidth), height: size(clientHeight) });
     try {
-      const reply = await fetchFile(this.client, path, signal, () => undefined);
+      const reply = await this.client.file(path, { signal, init: UNCACHED });
       if (!(reply.headers.get("content-type") ?? "").startsWith("image/")) throw new Error("the server sent no picture");
       return await reply.blob();
     } catch (error) {

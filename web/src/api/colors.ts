@@ -1,7 +1,7 @@
 /** Colours of atoms, for recolouring a surface without requesting a new mesh. */
 
 import { type Choices, query } from "../request";
-import type { Client } from "./client";
+import type { Client } from "../../client/src/client";
 
 export interface Legend {
   /** Colour scheme, a value of the parameter `color`. */

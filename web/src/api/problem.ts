@@ -1,48 +1,6 @@
-/** Problem documents of the service (RFC 9457) as errors. */
+/** Failures as problem documents, for display. */
 
-export interface ProblemDocument {
-  type: string;
-  title: string;
-  status: number;
-  detail?: string;
-  instance?: string;
-  suggested_resolution?: number;
-  parameter?: string;
-  [member: string]: unknown;
-}
-
-export class Problem extends Error {
-  constructor(readonly document: ProblemDocument) {
-    super(document.detail ?? document.title);
-    this.name = "Problem";
-  }
-
-  /** Returns true if the last segment of the type is one of `slugs`. */
-  is(...slugs: string[]): boolean {
-    return slugs.some((slug) => this.document.type.endsWith(`/${slug}`));
-  }
-
-  /** Returns the names and values of non-standard members, formatted for display. */
-  get numbers(): [string, string][] {
-    const standard = ["type", "title", "status", "detail", "instance", "diagnostics"];
-    return Object.entries(this.document)
-      .filter(([name, value]) => !standard.includes(name) && value !== null && typeof value !== "object")
-      .map(([name, value]) => [name.replaceAll(/[_-]/g, " "), typeof value === "number" ? value.toLocaleString("en") : String(value)]);
-  }
-}
-
-/** Returns the problem in a response, or one made from its status if it contains none, as from a proxy. */
-export async function problemOf(reply: Response): Promise<Problem> {
-  const fallback: ProblemDocument = {
-    type: "/problems/unknown",
-    title: `The server answered ${reply.status}`,
-    status: reply.status,
-    detail: reply.statusText,
-  };
-  if (!(reply.headers.get("content-type") ?? "").includes("json")) return new Problem(fallback);
-  const document = (await reply.json().catch(() => fallback)) as ProblemDocument;
-  return new Problem({ ...fallback, ...document });
-}
+import { Problem } from "../../client/src/problem";
 
 /** Returns any failure as a problem. Failures without a document are mostly connection errors. */
 export function asProblem(error: unknown): Problem {

@@ -1,7 +1,8 @@
 /** Structures: their paths, summaries and atom labels. */
 
+import type { AtomsDocument, StructureDocument } from "../../client/dist/api";
+import type { Client } from "../../client/src/client";
 import { type Choices, query } from "../request";
-import type { Client } from "./client";
 
 /** Source of a mesh: an upload, by the digest of its bytes, or an entry of the archive. */
 export interface Source {
@@ -17,33 +18,20 @@ export interface Source {
   resent?: boolean;
   /** True for the bundled structure, which the page opens by default. */
   isSample?: boolean;
-  summary?: Summary;
+  summary?: StructureDocument;
   /** Number of atoms in the file, once it is known. */
   atoms?: number;
 }
 
-export interface Summary {
-  digest: string;
-  id: string | null;
-  title: string | null;
-  atoms: number;
-  models: number[];
-  chains: { name: string; atoms: number }[];
-  assemblies: { id: string; copies: number | null }[];
-  atoms_in_model: { polymer: number; ligand: number; water: number; hydrogens: number };
-}
-
 /** Uploads a structure. Its path then gives access to meshes. */
 export async function upload(client: Client, blob: Blob, file: string, signal?: AbortSignal): Promise<Source> {
-  const options: RequestInit = { method: "POST", body: blob, headers: { "content-type": "application/octet-stream" } };
-  if (signal) options.signal = signal;
-  const summary = await client.json<Summary>("/v1/structures", options);
+  const summary = await client.upload(blob, { signal });
   return { path: `/v1/structures/${summary.digest}`, name: summary.id ?? file, file, blob, summary, atoms: summary.atoms };
 }
 
 /** Returns a structure that was uploaded before. */
 export async function stored(client: Client, digest: string, signal: AbortSignal): Promise<Source> {
-  const summary = await client.json<Summary>(`/v1/structures/${encodeURIComponent(digest)}`, { signal });
+  const summary = await client.json<StructureDocument>(`/v1/structures/${encodeURIComponent(digest)}`, { signal });
   const name = summary.id ?? "structure";
   return { path: `/v1/structures/${summary.digest}`, name, file: `${name.toLowerCase()}.cif`, summary, atoms: summary.atoms };
 }
@@ -52,15 +40,6 @@ export async function stored(client: Client, digest: string, signal: AbortSignal
 export function entry(id: string): Source {
   const name = id.trim();
   return { path: `/v1/pdb/${encodeURIComponent(name.toLowerCase())}`, name: name.toUpperCase(), file: "" };
-}
-
-/** Document of `GET …/atoms`: columns; the mesh attribute `_ATOM` contains row numbers. */
-interface AtomsDocument {
-  count: number;
-  names: string[];
-  elements: string[];
-  atoms: { name: number[]; element: number[]; index?: number[]; x?: number[]; y?: number[]; z?: number[] };
-  residues: { first: number[]; name: string[]; number: number[]; insertion_code: string[]; chain: string[]; model: number[]; kind: string[] };
 }
 
 export interface Atom {
@@ -77,6 +56,7 @@ export interface Atom {
   last: number;
 }
 
+/** Labels of atoms by row. The mesh attribute `_ATOM` contains row numbers. */
 export class Labels {
   constructor(private readonly document: AtomsDocument) {}
 
@@ -145,8 +125,8 @@ export interface Positions {
 export async function positions(client: Client, structure: string, selection: Choices, signal: AbortSignal): Promise<Positions> {
   const path = `${structure}/atoms${query(selection, { positions: "true" })}`;
   const { atoms, elements, residues } = await client.json<AtomsDocument>(path, { signal });
-  const { x = [], y = [], z = [], index = [] } = atoms;
-  return { x, y, z, index, elements: atoms.element.map((i) => elements[i] ?? "?"), residues: residues.name };
+  const { x, y, z, index } = atoms;
+  return { x: x ?? [], y: y ?? [], z: z ?? [], index: index ?? [], elements: atoms.element.map((i) => elements[i] ?? "?"), residues: residues.name };
 }
 
 /** Returns the name of an atom, such as `LYS 15 A · CA`. */

@@ -1,6 +1,6 @@
 /** Progress indicator over the surface. */
 
-import type { Job } from "../api/jobs";
+import type { JobDocument } from "../../client/dist/api";
 import { $, show } from "./dom";
 
 /** Delay, ms, before the indicator appears, so that short work does not show it. */
@@ -21,7 +21,7 @@ export class Busy {
   }
 
   /** Shows the state of a job. */
-  follow({ status, stage, fraction }: Job): void {
+  follow({ status, stage, fraction }: JobDocument): void {
     const isQueued = status === "accepted";
     const text = isQueued ? "Waiting in the queue…" : `${stage ?? "meshing"}, ${Math.round(100 * fraction)} %`;
     this.show(text, isQueued ? null : fraction, 0);

@@ -1,6 +1,6 @@
 /** Error message of the service with buttons for remedies. */
 
-import { type Problem } from "../api/problem";
+import type { Problem, ProblemDocument } from "../../client/src/problem";
 import { el } from "./dom";
 
 export interface Remedies {
@@ -21,7 +21,7 @@ export interface About {
 }
 
 /** Shows a problem in `home`. */
-export function problem(home: HTMLElement, { document, numbers }: Problem, about: About, remedies: Remedies): void {
+export function problem(home: HTMLElement, { document }: Problem, about: About, remedies: Remedies): void {
   const act = (words: string, action: () => void, primary = false) => {
     const button = el("button", { type: "button", class: primary ? "primary" : "" }, words);
     button.addEventListener("click", () => {
@@ -37,7 +37,7 @@ export function problem(home: HTMLElement, { document, numbers }: Problem, about
   if (typeof parameter === "string") actions.push(act(`Reset ${parameter.replaceAll("_", " ")}`, () => remedies.reset(parameter)));
   if (document.status === 0 || document.status >= 500 || document.status === 429) actions.push(act("Try again", () => remedies.again()));
   actions.push(act("Close", () => undefined));
-  const list = numbers.filter(([name]) => name !== "suggested resolution").flatMap(([name, value]) => [el("dt", {}, name), el("dd", {}, value)]);
+  const list = numbersOf(document).filter(([name]) => name !== "suggested resolution").flatMap(([name, value]) => [el("dt", {}, name), el("dd", {}, value)]);
   home.replaceChildren(
     el("strong", {}, about.name ? `${about.name}: ${document.title}` : document.title),
     ...(document.detail ? [el("p", {}, document.detail)] : []),
@@ -46,4 +46,12 @@ export function problem(home: HTMLElement, { document, numbers }: Problem, about
     el("div", { class: "row" }, ...actions),
   );
   home.hidden = false;
+}
+
+/** Returns the names and values of non-standard members, formatted for display. */
+function numbersOf(document: ProblemDocument): [string, string][] {
+  const standard = ["type", "title", "status", "detail", "instance", "diagnostics"];
+  return Object.entries(document)
+    .filter(([name, value]) => !standard.includes(name) && value !== null && typeof value !== "object")
+    .map(([name, value]) => [name.replaceAll(/[_-]/g, " "), typeof value === "number" ? value.toLocaleString("en") : String(value)]);
 }

@@ -1,6 +1,6 @@
 /** Report of the shown surface, first from the file, later from the service's report. */
 
-import type { Client } from "../api/client";
+import type { Client } from "../../client/src/client";
 import { el, number } from "./dom";
 
 export type Report = Record<string, unknown>;
