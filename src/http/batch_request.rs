@@ -95,7 +95,7 @@ impl NewBatch {
         match stored {
             Ok(stored) => existing(stored, &record),
             Err(problem) => {
-                // Nobody would know their ids.
+                // Without a key, no later request can continue the batch.
                 if key.is_none()
                     && let Err(error) = jobs.dismiss_batch(&record).await
                 {
