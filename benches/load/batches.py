@@ -40,14 +40,14 @@ def residues(path):
     return list(found.values())
 
 
-def write_structures(sources, folder, count):
-    """Writes the structures, and returns the total number of residues."""
+def write_structures(sources, folder, count, smallest=100):
+    """Writes structures of `smallest` residues or more, and returns the total number of residues."""
     generator = random.Random(2010)
-    chains = [found for found in map(residues, sources) if len(found) >= 100]
+    chains = [found for found in map(residues, sources) if len(found) >= smallest]
     total = 0
     for number in range(count):
         chain = generator.choice(chains)
-        size = generator.randint(100, min(1000, len(chain)))
+        size = generator.randint(smallest, min(1000, len(chain)))
         first = generator.randint(0, len(chain) - size)
         shift = generator.uniform(0.0, 5.0)
         with open(folder / f"s{number:05}.pdb", "w", encoding="latin-1") as file:

@@ -19,19 +19,35 @@ With `--job-seconds`, one job at a time that takes about this long alone is stop
 until it ends within a drain of `--drain-ms`. The script prints a row for each stop: no stop may count an attempt. The
 last row is the control, a kill (`kill -9`), which counts one. The exit code is 1 if a stop counted an attempt or was
 not orderly, the kill did not count one, or a job did not end with the right mesh.
+
+    python3 benches/load/chaos.py target/release/molmesh samples/4pti.pdb --kills 200 --batch 500
+
+With `--batch`, clients post one batch of this many small structures until it is accepted, and then read its results
+again and again. The service is killed while it accepts the batch, recovers, works and sends results. Kills wait for
+files to end, so that the batch outlasts them. The final archive of results must have each mesh of `molmesh mesh`
+exactly once, and must begin with every response that a kill cut off. Only a file whose last attempt was killed may be
+missing; it counts as abandoned. The exit code is 1 if the batch or a file is lost, a result is wrong or duplicated, the
+service does not stop in order, or the run tests nothing: the batch was not open at most of the kills, no response was
+cut off, or half of the files failed.
 """
 
 import argparse
 import collections
+import http.client
+import io
 import json
 import os
 import random
 import re
+import signal
 import subprocess
 import sys
+import tarfile
 import threading
 import time
+from pathlib import Path
 
+from batches import write_structures
 from mixed import UNAVAILABLE, Expected, Server, fetch, folder
 
 OPEN = ("accepted", "running")
@@ -39,6 +55,10 @@ OPEN = ("accepted", "running")
 DRAIN_MS = 300
 # Time for all remaining jobs to end, s.
 FINISH_TIMEOUT = 300
+# Default of `jobs.attempts`.
+ATTEMPTS = 3
+# Parameters of a batch. Its results are small, because they are sent again after every kill.
+BATCH = {"resolution": "0.6", "surface": "ses", "compress": "meshopt"}
 
 
 class Clients:
@@ -53,14 +73,17 @@ class Clients:
 
     def submit(self, dice):
         while not self.over.is_set():
-            structure, query, mesh = self.expected.next_request(dice)
             try:
-                status, headers, _ = fetch(self.port, "POST", f"/v1/meshes?{query}", structure, {"prefer": "respond-async"}, 10)
-                if status == 202:
-                    self.jobs[headers["location"]] = mesh
+                self.request(dice)
             except UNAVAILABLE:
                 pass
             time.sleep(0.02)
+
+    def request(self, dice):
+        structure, query, mesh = self.expected.next_request(dice)
+        status, headers, _ = fetch(self.port, "POST", f"/v1/meshes?{query}", structure, {"prefer": "respond-async"}, 10)
+        if status == 202:
+            self.jobs[headers["location"]] = mesh
 
     def finish(self):
         self.over.set()
@@ -118,6 +141,11 @@ def stop(server, before, dice):
     return errors
 
 
+def is_abandoned(problem):
+    """Returns true for the problem of a job without attempts left. A job that lost its input has the same type."""
+    return bool(problem) and (problem["type"], problem.get("actual")) == ("/problems/job-abandoned", ATTEMPTS)
+
+
 def outcome(port, job, mesh, deadline):
     """Waits for a job. Returns `successful`, `abandoned`, or an error that begins with `bad`."""
     status, document = None, {"status": "accepted"}
@@ -129,8 +157,7 @@ def outcome(port, job, mesh, deadline):
             return f"bad: status {status}"
         document = json.loads(body)
     if document["status"] != "successful":
-        problem = document.get("problem") or {}
-        return "abandoned" if problem.get("type") == "/problems/job-abandoned" else f"bad: {document}"
+        return "abandoned" if is_abandoned(document.get("problem")) else f"bad: {document}"
     status, headers, _ = fetch(port, "GET", f"{job}/result")
     status, _, body = fetch(port, "GET", headers["location"]) if status == 303 else (status, None, None)
     return "successful" if (status, body) == (200, mesh) else f"bad: result with status {status}"
@@ -233,6 +260,122 @@ def stop_long_jobs(args, dice):
         sys.exit(f"errors occurred with seed {args.seed}: see above")
 
 
+class BatchClients(Clients):
+    """Threads that post one batch until it is accepted, and then read its results."""
+
+    def __init__(self, port, archive, number):
+        self.location, self.results, self.cut, self.errors = None, b"", 0, []
+        super().__init__(port, archive, 0, number)
+
+    def request(self, _dice):
+        self.compare(self.read() if self.location else self.post())
+
+    def post(self):
+        """Posts the batch. If it was accepted before, the response must name the same one."""
+        query, key = "&".join(map("=".join, BATCH.items())), {"idempotency-key": "chaos"}
+        status, headers, _ = fetch(self.port, "POST", f"/v1/batches?{query}", self.expected, key, FINISH_TIMEOUT)
+        location = headers["location"]
+        self.location = self.location or location
+        if status not in (202, 503) or location not in (None, self.location):
+            self.errors.append(f"bad: status {status} for the batch {location}")
+        return b""
+
+    def read(self, part="/results.tar"):
+        """Reads a part of the batch, as far as the service sends it."""
+        try:
+            status, _, body = fetch(self.port, "GET", self.location + part, timeout=FINISH_TIMEOUT)
+        except http.client.IncompleteRead as error:
+            self.cut += len(error.partial) > 0
+            return error.partial
+        self.errors += [] if status in (200, 503) else [f"bad: status {status} for {part}"]
+        return body if status == 200 else b""
+
+    def compare(self, results):
+        """Compares the beginnings of two archives, and keeps the longer one."""
+        short, self.results = sorted((results, self.results), key=len)
+        self.errors += [] if self.results.startswith(short) else ["bad: results that differ"]
+
+
+def write_batch(args):
+    """Returns an archive of small structures, and their meshes by name in the results."""
+    inputs, meshes, archive = folder(), folder(), io.BytesIO()
+    write_structures(map(Path, args.structures), Path(inputs), args.batch, 20)
+    with tarfile.open(fileobj=archive, mode="w") as tar:
+        for path in Path(inputs).iterdir():
+            tar.add(path, path.name)
+    options = [part for name, value in BATCH.items() for part in (f"--{name}", value)]
+    command = [args.binary, "mesh", f"{inputs}/", "-o", f"{meshes}/", "--backend", "cpu", "--quiet", *options]
+    subprocess.run(command, check=True)
+    return archive.getvalue(), {path.name: path.read_bytes() for path in Path(meshes).iterdir()}
+
+
+def file_outcomes(archive, meshes):
+    """Counts the outcomes of the files of a batch."""
+    copies = collections.defaultdict(list)
+    with tarfile.open(fileobj=io.BytesIO(archive)) as tar:
+        for entry in tar:
+            copies[entry.name].append(tar.extractfile(entry).read())
+    lines = [json.loads(line) for line in b"".join(copies.pop("summary.jsonl")).splitlines()]
+    ends = collections.Counter()
+    for line in lines:
+        name, problem = line["input"].replace(".pdb", ".glb"), line.get("problem")
+        found = copies.pop(name, [])
+        if found == [meshes.get(name)] and problem is None:
+            ends["successful"] += 1
+        else:
+            bad = f"bad: right results {[mesh == meshes.get(name) for mesh in found]}, {problem}"
+            ends["abandoned" if not found and is_abandoned(problem) else bad] += 1
+    ends["bad: results or lines without the other"] = len(copies) + abs(len(lines) - len(meshes))
+    return ends
+
+
+def kill_batch(args, server, dice):
+    """Kills the service at random points of a batch."""
+    archive, meshes = write_batch(args)
+    if len(set(meshes.values())) != args.batch:
+        sys.exit("two structures have the same mesh")
+    ended_jobs = lambda: len(list(Path(server.folder, "store/jobs").glob("*.ended.json")))
+    clients = BatchClients(args.port, archive, args.clients)
+    phases, with_batch, last_attempts, ready = collections.Counter(), 0, set(), 0.1
+    for left in range(args.kills, 0, -1):
+        phase = dice.choice(["work", "work", "recovery"]) if clients.location else "acceptance"
+        ended, deadline = ended_jobs(), time.monotonic() + FINISH_TIMEOUT
+        if phase == "recovery":
+            server.launch()
+        else:
+            ready = server.start()
+        # About the remaining files divided by the remaining kills.
+        goal = min(ended + dice.randint(0, 2 * (args.batch - ended) // left), args.batch - 1)
+        while phase == "work" and ended_jobs() < goal and time.monotonic() < deadline:
+            time.sleep(0.005)
+        # Kills come later and later until one comes after the acceptance.
+        latest = {"acceptance": 0.04 * args.batch * (1 - left / args.kills), "recovery": ready, "work": 0.05}[phase]
+        time.sleep(dice.uniform(0, latest))
+        server.process.kill()
+        is_killed = server.process.wait() == -signal.SIGKILL and time.monotonic() < deadline
+        clients.errors += [] if is_killed else ["bad: the service ended by itself, or made no progress"]
+        phases[phase] += 1
+        jobs = open_jobs(server.folder)
+        with_batch += not clients.location or len(jobs) > 0
+        last_attempts |= {job for job, found in jobs.items() if found == ("running", ATTEMPTS)}
+    clients.finish()
+    server.start()
+    clients.post()
+    results, counts = clients.read(), json.loads(clients.read(""))["counts"]
+    clients.errors += [] if results.startswith(clients.results) else ["bad: results that differ"]
+    code, _ = server.stop()
+    ends = file_outcomes(results, meshes) + collections.Counter(clients.errors)
+    print(f"{args.kills} kills: {dict(phases)}; the batch was open or not yet accepted at {with_batch} of them")
+    print(f"{args.batch} files: {dict(ends)}; state {counts}; {clients.cut} responses were cut off")
+    print(f"the last attempts of {len(last_attempts)} jobs were killed; the service stopped with {code}")
+    bad = [end for end in ends if end.startswith("bad")] or code or ends["abandoned"] > len(last_attempts)
+    is_test = clients.cut and ends["successful"] > args.batch // 2 and with_batch > args.kills // 2
+    if not is_test:
+        print("bad: too few kills during the batch, responses that were cut off, or successful files: this tests nothing")
+    if bad or not is_test or counts["successful"] != ends["successful"]:
+        sys.exit(f"errors occurred with seed {args.seed}: see above")
+
+
 def main():
     parser = argparse.ArgumentParser()
     parser.add_argument("binary")
@@ -242,6 +385,7 @@ def main():
     parser.add_argument("--clients", type=int, default=3)
     parser.add_argument("--port", type=int, default=18500)
     parser.add_argument("--job-seconds", type=float, help="stop one job that takes this long alone")
+    parser.add_argument("--batch", type=int, help="kill the service during one batch of this many files")
     parser.add_argument("--drain-ms", type=int, default=2000, help="drain with --job-seconds")
     args = parser.parse_args()
     print(f"seed {args.seed}", flush=True)
@@ -249,6 +393,8 @@ def main():
     if args.job_seconds:
         return stop_long_jobs(args, dice)
     server = Server(args.binary, data, args.port, ["--backend", "cpu", "--set", "server.termination_notice_ms=none"])
+    if args.batch:
+        return kill_batch(args, server, dice)
     command = server.command
     clients = Clients(args.port, Expected(args.binary, args.structures), args.seed, args.clients)
     phases, with_jobs, jobs, errors = collections.Counter(), 0, {}, []
