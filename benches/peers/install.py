@@ -83,9 +83,24 @@ def packages(*names):
     def ready():
         wanted = [*names, *BASE]
         if not has(python(), wanted):
-            pip(wanted)
+            try:
+                pip(wanted)
+            except Missing as error:
+                pins = [line for line in PINS.read_text().split() if line.split("==")[0] in names]
+                raise Missing(f"{', '.join(pins)}: {error}") from error
         code = "import importlib.metadata as m, sys; print(', '.join(n + ' ' + m.version(n) for n in sys.argv[1:]))"
         return output_of([python(), "-c", code, *names, "numpy"])
+
+    return ready
+
+
+def wheel(file):
+    """Returns a function that installs a wheel, also instead of another one of the same version, and returns its
+    version."""
+    def ready():
+        pip([file])
+        pip(["--force-reinstall", "--no-deps", file])
+        return packages(file.name.split("-")[0])()
 
     return ready
 

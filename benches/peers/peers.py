@@ -1,13 +1,16 @@
-"""Compares molmesh with other programs on the same structure files, in turn, on a RAM disk.
+"""Compares molmesh with other programs and Python packages on the same structures, in turn, on a RAM disk.
 
     # The samples; then 1UBQ, 1A0Q, 7CTH and 6ZU5 of a folder, with an update of the page; then some files and programs.
     python3 benches/peers/peers.py
     python3 benches/peers/peers.py --data FOLDER --publish
     python3 benches/peers/peers.py --files A.pdb B.cif --only molmesh,splashsurf --rounds 9
+    # Packages instead of programs: 1UBQ, 2HHB and 1AON of a folder.
+    python3 benches/peers/peers.py --wheel dist/molmesh-….whl --data FOLDER --publish
 
-Requires `cargo build --release`, Python 3.11, and the package managers of the programs (cargo, npm, apt-get). Missing
-programs are installed into target/peers. A program that cannot be installed, fails or takes too long has a row with the
-reason. Each run is a complete process from a file to a file. docs/research/peers.md describes the comparison.
+Requires `cargo build --release` or a wheel of molmesh, Python 3.11, and the package managers of the programs (cargo,
+npm, apt-get). Missing programs are installed into target/peers. A program that cannot be installed, fails or takes too
+long has a row with the reason. Each run is a complete process: of a program from a file to a file, of a package several
+calls, of which only these are timed. docs/research/peers.md describes the comparison.
 """
 
 import argparse
@@ -21,11 +24,11 @@ import tempfile
 from pathlib import Path
 
 import tables
-from catalog import Job, catalog
+from catalog import TASKS, Job, catalog, packages
 from install import ROOT, Missing, helper
 
 HERE = Path(__file__).resolve().parent
-DEFAULT = ("1ubq", "1a0q", "7cth", "6zu5")
+DEFAULT = {"peers": ("1ubq", "1a0q", "7cth", "6zu5"), "packages": ("1ubq", "2hhb", "1aon")}
 SUFFIXES = (".pdb", ".ent", ".cif", ".pdb.gz", ".ent.gz", ".cif.gz")
 
 
@@ -34,20 +37,26 @@ def options():
     parser.add_argument("--data", type=Path, default=ROOT / "samples", help="folder of structures [samples]")
     parser.add_argument("--files", type=Path, nargs="+", help="structure files instead of --data: PDB or mmCIF, plain or gzip")
     parser.add_argument("--rounds", type=int, default=5, help="timed runs of each program [5]")
-    parser.add_argument("--only", help="programs, comma-separated; molmesh is always included")
+    parser.add_argument("--only", help="programs or packages, comma-separated; molmesh is always included")
     parser.add_argument("--limit", type=float, default=120, help="time limit of a run, s [120]")
     parser.add_argument("--spacing", type=float, default=0.5, help="grid spacing, Å [0.5]")
     parser.add_argument("--molmesh", type=Path, default=ROOT / "target/release/molmesh", help="molmesh binary")
+    parser.add_argument("--wheel", type=Path, help="wheel of molmesh; compares Python packages instead of programs")
     parser.add_argument("--json", type=Path, help="file for the figures")
     parser.add_argument("--page", type=Path, help="page for the tables, between its markers")
     parser.add_argument("--note", default="", help="sentence for the header of the tables, such as other load on the machine")
-    parser.add_argument("--publish", action="store_true", help="--json docs/results/peers.json --page docs/research/peers.md")
+    parser.add_argument("--publish", action="store_true", help="write docs/research/peers.md and docs/results")
     given = parser.parse_args()
     if given.rounds < 1 or given.limit <= 0 or given.spacing <= 0:
         parser.error("--rounds, --limit and --spacing must be positive")
     if given.publish:
-        given.json, given.page = ROOT / "docs/results/peers.json", ROOT / "docs/research/peers.md"
+        given.json, given.page = ROOT / f"docs/results/{kind(given)}.json", ROOT / "docs/research/peers.md"
     return given
+
+
+def kind(given):
+    """Returns the name of the results and of the markers of their tables."""
+    return "packages" if given.wheel else "peers"
 
 
 def chosen_files(given):
@@ -55,7 +64,7 @@ def chosen_files(given):
     if given.files:
         return given.files
     there = sorted(path for path in given.data.iterdir() if path.name.lower().endswith(SUFFIXES))
-    known = [path for name in DEFAULT for path in there if path.name.lower().split(".")[0] == name]
+    known = [path for name in DEFAULT[kind(given)] for path in there if path.name.lower().split(".")[0] == name]
     return known or there or sys.exit(f"no structures in {given.data}")
 
 
@@ -98,7 +107,10 @@ def launch(peer, job, limit):
     if run["status"] != 0 or not mesh.exists() or mesh.stat().st_size == 0:
         words = errors.read_text(errors="replace").strip().splitlines()
         return {"failed": f"status {run['status']}" + (f", {words[-1][:160]}" if words else "")}
-    return {"wall": run["wall"], "kb": run["kb"]}
+    # A package measures its calls without the start of Python and the import.
+    report = Path(job.mesh(".json"))
+    own = json.loads(report.read_text()) if report.exists() else {}
+    return {"wall": run["wall"], "kb": run["kb"], **own}
 
 
 def first(peer, job, limit):
@@ -108,7 +120,8 @@ def first(peer, job, limit):
     if "wall" not in outcome:
         return {**entry, **outcome}
     try:
-        return {**entry, "runs": [], "mesh": ask("check.py", job.mesh(peer.extension))[0]}
+        mesh = {"area": outcome["area"]} if "area" in outcome else ask("check.py", job.mesh(peer.extension))[0]
+        return {**entry, "runs": [], "mesh": mesh}
     except RuntimeError as error:
         return {**entry, "failed": str(error)}
 
@@ -154,7 +167,7 @@ def same_atoms(molmesh, structure):
 def ready(peers):
     """Returns versions by name, and the reasons for missing programs."""
     versions, absent = {}, {}
-    for peer in peers:
+    for peer in {peer.name: peer for peer in peers}.values():
         try:
             versions[peer.name] = peer.ready()
         except Missing as error:
@@ -164,34 +177,45 @@ def ready(peers):
 
 def main():
     given = options()
-    peers = catalog(given.molmesh.resolve())
+    groups = [(None, catalog(given.molmesh.resolve()))]
+    if given.wheel:
+        cores = sorted({1, len(os.sched_getaffinity(0))})
+        groups = [(n, packages(given.wheel.resolve(), task, n)) for task in TASKS for n in cores]
+    peers = [peer for _, group in groups for peer in group]
     if given.only:
         names = {"molmesh", *given.only.split(",")}
         unknown = names - {peer.name for peer in peers}
         if unknown:
-            sys.exit(f"no such program: {', '.join(sorted(unknown))}; there are {', '.join(p.name for p in peers)}")
+            there = dict.fromkeys(peer.name for peer in peers)
+            sys.exit(f"no such program: {', '.join(sorted(unknown))}; there are {', '.join(there)}")
+        groups = [(n, [peer for peer in group if peer.name in names]) for n, group in groups]
         peers = [peer for peer in peers if peer.name in names]
     versions, absent = ready(peers)
     if "molmesh" in absent:
-        sys.exit(f"{absent['molmesh']}: cargo build --release, or --molmesh BINARY")
+        sys.exit(f"{absent['molmesh']}: cargo build --release, or --molmesh BINARY; make wheel, or --wheel FILE")
     result = {"date": datetime.date.today().isoformat(), "machine": machine(), "spacing": given.spacing,
               "rounds": given.rounds, "limit": given.limit, "note": given.note, "versions": versions, "structures": []}  # fmt: skip
     ram = "/dev/shm" if os.path.isdir("/dev/shm") else None
     for file in chosen_files(given):
         with tempfile.TemporaryDirectory(dir=ram, prefix="peers-") as folder:
             structure = ask("prepare.py", folder, file)[0]
-            same_atoms(given.molmesh, structure)
+            if given.wheel:
+                ask("atom_arrays.py", folder, structure["file"])
+            else:
+                same_atoms(given.molmesh, structure)
             job = Job(structure["name"], Path(structure["file"]), Path(folder), given.spacing, Path(folder) / "mesh")
-            programs = compare(peers, absent, job, given)
-        result["structures"].append({"name": structure["name"], "atoms": structure["atoms"], "load": os.getloadavg()[0],
-                                     "programs": programs})  # fmt: skip
-        title, rows = tables.section(result["structures"][-1])
-        print(f"\n{title}\n{tables.terminal(rows)}", flush=True)
+            for n, group in groups:
+                labels = {"cores": n} if n else {}
+                programs = compare(group, absent, job, given)
+                result["structures"].append({"name": structure["name"], "atoms": structure["atoms"], **labels,
+                                             "load": os.getloadavg()[0], "programs": programs})  # fmt: skip
+                title, rows = tables.section(result["structures"][-1])
+                print(f"\n{title}\n{tables.terminal(rows)}", flush=True)
         if given.json:  # after each structure, so that an interrupted run keeps its results
             given.json.parent.mkdir(parents=True, exist_ok=True)
             given.json.write_text(json.dumps(result, indent=1, ensure_ascii=False) + "\n")
     if given.page:
-        given.page.write_text(tables.between(given.page.read_text(), tables.page(result)))
+        given.page.write_text(tables.between(given.page.read_text(), tables.page(result), kind(given)))
 
 
 if __name__ == "__main__":

@@ -34,7 +34,7 @@ def summary(runs):
 def near_equal(entry, ours):
     """Adds ratios per triangle if the numbers of triangles differ by more than `NEAR`."""
     theirs = entry.get("mesh")
-    if not (ours and theirs and theirs["triangles"] and "times_ours" in entry):
+    if not (ours and theirs and theirs.get("triangles") and "times_ours" in entry):
         return
     factor = ours["triangles"] / theirs["triangles"]
     if abs(1 / factor - 1) > NEAR:
@@ -61,6 +61,8 @@ def significant(value, digits=3):
 def mesh_cells(mesh):
     if not mesh:
         return ["–"] * 4
+    if "closed" not in mesh:  # an area without a mesh
+        return ["–", "–", significant(mesh["area"], 4), "–"]
     if mesh["closed"]:
         closed = "yes"
     else:
@@ -72,7 +74,7 @@ def mesh_cells(mesh):
 
 def row(name, entry):
     """Returns the cells of one program, in the order of `HEAD`."""
-    surface = SURFACES[entry["surface"]]
+    surface = SURFACES.get(entry["surface"], entry["surface"])
     triangles, closed, area, volume = mesh_cells(entry.get("mesh"))
     if "missing" in entry or "failed" in entry:
         why = f"not available: {entry['missing']}" if "missing" in entry else f"failed: {entry['failed']}"
@@ -91,8 +93,8 @@ def row(name, entry):
     ]  # fmt: skip
 
 
-def markdown(rows):
-    lines = ["| " + " | ".join(HEAD) + " |", "|" + "---|" * len(HEAD)]
+def markdown(rows, head=HEAD):
+    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
     return "\n".join(lines + ["| " + " | ".join(cells) + " |" for cells in rows])
 
 
@@ -113,7 +115,30 @@ def terminal(rows):
 def section(structure):
     """Returns the title and the rows of one structure."""
     title = f"{structure['name'].upper()}: {structure['atoms']:,} atoms"
+    title += f", cores: {structure['cores']}" if "cores" in structure else ""
     return title, [row(name, entry) for name, entry in structure["programs"].items()]
+
+
+def package_tables(result):
+    """Formats a table for each structure, with one row per task and package. Memory and mesh are those of the run on
+    the most cores."""
+    cores = result["machine"]["cores"]
+    head = ["task", "package", "1 core: s", HEAD[3], f"{cores} cores: s", *(HEAD[k] for k in (3, 4, 6, 9, 10))]
+    for name in dict.fromkeys(s["name"] for s in result["structures"]):
+        groups = [s for s in result["structures"] if s["name"] == name]
+        cells = {}
+        for group in groups:
+            for program, entry in group["programs"].items():
+                cells.setdefault((entry["surface"], program), {})[group["cores"]] = row(program, entry)
+        rows = []
+        for (task, program), runs in cells.items():
+            times = [runs.get(n, ["–"] * len(HEAD))[2:4] for n in (1, cores)]
+            if times[0] == times[1] and times[0][0][0].isalpha():  # a reason
+                times[1] = ["–", "–"]
+            version = result["versions"].get(program, program).split(",")[0]
+            rows.append([task, version, *times[0], *times[1], *(runs[max(runs)][k] for k in (4, 6, 9, 10))])
+        yield f"### {name.upper()}: {groups[0]['atoms']:,} atoms"
+        yield markdown(rows, head)
 
 
 def overview(result):
@@ -147,18 +172,20 @@ def page(result):
         f"{machine['cpu']}, {machine['cores']} cores, {machine['memory_gb']:.0f} GB, {machine['system']}; {load}.",
         f"{result['date']}, grid {result['spacing']:g} Å, {result['rounds']} rounds after"
         f" one that is not timed, {result['limit']:g} s a run at most.{note}",
-        "\n".join(f"- {version}" for version in versions),
-        overview(result),
     ]
+    if "cores" in result["structures"][0]:
+        return "\n\n".join([*parts, *package_tables(result)])
+    parts += ["\n".join(f"- {version}" for version in versions), overview(result)]
     for structure in result["structures"]:
         title, rows = section(structure)
         parts += [f"### {title}", markdown(rows)]
     return "\n\n".join(parts)
 
 
-def between(text, content, begin="<!-- peers: begin -->", end="<!-- peers: end -->"):
-    """Returns `text` with the content between two markers replaced. Raises ValueError unless each marker occurs
-    once."""
+def between(text, content, name):
+    """Returns `text` with the content between the two markers of this name replaced. Raises ValueError unless each
+    marker occurs once."""
+    begin, end = f"<!-- {name}: begin -->", f"<!-- {name}: end -->"
     if text.count(begin) != 1 or text.count(end) != 1 or text.index(begin) > text.index(end):
         raise ValueError(f"the page must have {begin} and {end}, once each and in this order")
     head, rest = text.split(begin)

@@ -1,6 +1,6 @@
 """Tests of the comparison: `MOLMESH=BINARY python test_peers.py`.
 
-Requires the packages that tests/tools/setup.sh installs (gemmi, numpy, trimesh), but no peers.
+Requires the packages that tests/tools/setup.sh installs (freesasa, gemmi, numpy, trimesh), but no other peers.
 """
 
 import json
@@ -8,19 +8,19 @@ import os
 import subprocess
 import sys
 import tempfile
+import time
 import unittest
 from pathlib import Path
 
 import numpy as np
 
+import atom_arrays
 import check
 import gpu_field
 import peers
-import prepare
 import tables
 from catalog import Job, Peer
 from install import ROOT
-from radii import RADII
 
 HERE = Path(__file__).resolve().parent
 MOLMESH = os.environ["MOLMESH"]
@@ -115,11 +115,29 @@ class Tables(unittest.TestCase):
         for line in ("| near | 3 |", "| slow | > 30 |", "| absent | – |"):
             self.assertIn(line, overview)
 
+    def test_a_package_has_one_row_for_one_and_for_all_cores(self):
+        def group(cores, runs):
+            entries = {"molmesh": {"runs": runs}, "rust": {"runs": [{**run, "wall": 3 * run["wall"]} for run in runs]},
+                       "freesasa": {"missing": "freesasa==2.2.1: pip failed"}}  # fmt: skip
+            programs = {name: {"surface": "SAS area of atoms", "mesh": {"area": 3978.0}, **entry}
+                        for name, entry in entries.items()}  # fmt: skip
+            return {"name": "4pti", "atoms": 454, "cores": cores, "load": 0.5, "programs": tables.summary(programs)}
+
+        machine = {"cpu": "x", "cores": 4, "memory_gb": 1, "system": "Linux", "load": 0.5}
+        groups = [group(1, [{"round": 0, "wall": 2, "kb": 1024}]), group(4, [{"round": 0, "wall": 0.5, "kb": 2048}])]
+        page = tables.page({"machine": machine, "date": "2026-11-22", "spacing": 0.5, "rounds": 1, "limit": 9.0,
+                            "versions": {"rust": "rust 0.7.3, numpy 2.4.6"}, "structures": groups})  # fmt: skip
+        for cells in ("| task | package | 1 core: s | × time | 4 cores: s | × time | MB | triangles | closed | area",
+                      "| molmesh | 2 | 1 | 0.5 | 1 | 2 | – | – | 3,978 |",
+                      "| rust 0.7.3 | 6 | 3 | 1.5 | 3 | 2 | – | – | 3,978 |",
+                      "| freesasa | not available: freesasa==2.2.1: pip failed | – | – | – | – |"):  # fmt: skip
+            self.assertIn(cells, page)
+
     def test_page_content_between_markers_is_replaced(self):
-        begin, end = "<!-- peers: begin -->", "<!-- peers: end -->"
-        self.assertEqual(tables.between(f"a\n{begin}\nold\n{end}\nb", "new"), f"a\n{begin}\n\nnew\n\n{end}\nb")
+        begin, end = "<!-- x: begin -->", "<!-- x: end -->"
+        self.assertEqual(tables.between(f"a\n{begin}\nold\n{end}\nb", "new", "x"), f"a\n{begin}\n\nnew\n\n{end}\nb")
         for broken in (f"{begin} only", f"{end} {begin}", f"{begin} {begin} {end}"):
-            self.assertRaises(ValueError, tables.between, broken, "new")
+            self.assertRaises(ValueError, tables.between, broken, "new", "x")
 
 
 class Runs(unittest.TestCase):
@@ -143,6 +161,22 @@ class Runs(unittest.TestCase):
         self.assertLess(small["kb"], 100 << 10)
         self.assertGreater(large["kb"], 200 << 10)
 
+    def test_a_package_reports_the_time_of_its_calls(self):
+        with tempfile.TemporaryDirectory() as folder:
+            target, atoms = str(Path(folder) / "mesh"), str(Path(folder) / "4pti.npz")
+            np.savez(atoms, **atom_arrays.arrays(SAMPLE))
+            command = [sys.executable, str(HERE / "package_peer.py"), "SAS area of atoms", "freesasa", "1", "0.5", atoms,
+                       str(SAMPLE), target]  # fmt: skip
+            job = Job("4pti", SAMPLE, Path(folder), 0.5, Path(target))
+            peer = Peer("freesasa", "SAS area of atoms", ".json", lambda job: command, lambda: "1")
+            begin = time.perf_counter()
+            outcome = peers.launch(peer, job, 60)
+            # The start of Python and the import of numpy are in the time of the process alone.
+            self.assertLess(outcome["wall"] + 0.02, time.perf_counter() - begin)
+            # The exact area is 3,977.7 Å².
+            self.assertLess(abs(outcome["area"] / 3977.7 - 1), 0.005)
+            self.assertGreater(outcome["kb"], 10 << 10)
+
     def test_molmesh_alone(self):
         with tempfile.TemporaryDirectory() as folder:
             target = Path(folder) / "peers.json"
@@ -159,11 +193,8 @@ class Runs(unittest.TestCase):
 
     def test_the_array_program_computes_our_mesh(self):
         with tempfile.TemporaryDirectory() as folder:
-            structure = prepare.heavy(SAMPLE)
-            rows = list(structure[0].all())
-            radii = np.array([RADII[row.atom.element.name.upper()] for row in rows], np.float32)
             atoms = Path(folder) / "4pti.npz"
-            np.savez(atoms, positions=np.array([row.atom.pos.tolist() for row in rows]), radii=radii)
+            np.savez(atoms, **atom_arrays.arrays(SAMPLE))
             command = [MOLMESH, "mesh", str(SAMPLE), "--resolution", "2", "--backend", "cpu", "--report", "json"]
             done = subprocess.run([*command, "-o", str(Path(folder) / "x.ply")], capture_output=True, text=True)
             ours, case = json.loads(done.stdout), gpu_field.Case(atoms, 2.0)
