@@ -10,7 +10,6 @@ use bytes::Bytes;
 
 use super::content_type::DeclaredType;
 use super::document;
-use super::form::UploadedMap;
 use super::guard::Caller;
 use super::openapi::bodies::{AS_FOR_MESHES, StructureFile};
 use super::openapi::meshes::NotModified;
@@ -21,7 +20,7 @@ use super::problem::Problem;
 use super::problem_types::ProblemType;
 use super::source::{DocumentRequest, Loaded};
 use super::state::{App, Delivery, Shared};
-use crate::jobs::Failure;
+use crate::jobs::{Failure, UploadedMap};
 use crate::pipeline::areas;
 use crate::pipeline::params;
 use crate::pipeline::params::areas::AreasRequest;

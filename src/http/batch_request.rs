@@ -259,14 +259,12 @@ impl NewBatch {
             self.app.store.put_input(&loaded.digest, namespace, file.clone()).await?;
         }
         for output in &self.plan.jobs {
-            let format = output.request.format;
             let spec = JobSpec {
                 task: Task {
                     input: Input::File(file.clone()),
                     digest: loaded.digest,
                     namespace,
-                    strict: output.request.strict,
-                    options: output.request.options.clone(),
+                    request: output.request.clone(),
                     rank: self.rank,
                     reservation: Some(Arc::clone(&loaded.reservation)),
                     parent: self.parent.clone(),
@@ -275,9 +273,8 @@ impl NewBatch {
                 file: file.clone(),
                 map: None,
                 parameters: output.pairs.clone(),
-                format,
                 // A key of a client has no tab.
-                idempotency_key: Some(format!("{}\t{index}\t{}", batch.as_str(), format.name())),
+                idempotency_key: Some(format!("{}\t{index}\t{}", batch.as_str(), output.request.format.name())),
                 batch: Some(batch.clone()),
             };
             accepted.push(self.app.job_store.accept(spec, None).await?.record.id);

@@ -15,7 +15,7 @@ use super::body_hasher::BodyHasher;
 use super::content_type::DeclaredType;
 use super::problem::Problem;
 use super::problem_types::ProblemType;
-use crate::jobs::MemoryReservation;
+use crate::jobs::{MemoryReservation, UploadedMap};
 use crate::store::Digest;
 use crate::surface::{Exceeded, Limit};
 
@@ -95,13 +95,6 @@ fn unreadable(error: &multer::Error, body: &Exceeded) -> Problem {
         }
         other => Problem::new(ProblemType::BadRequest, format!("the form cannot be read: {other}")),
     }
-}
-
-/// Received map.
-pub(super) struct UploadedMap {
-    pub(super) bytes: Bytes,
-    /// SHA-256 of `bytes`.
-    pub(super) digest: Digest,
 }
 
 /// Received structure file.

@@ -104,8 +104,7 @@ impl MeshRequest {
         // Strict checks and reports need a run, a declared format is checked by parsing, and a job has its own address.
         let is_reusable = !request.strict && !report && !declared.is_structure() && !self.preferences.respond_async;
         let namespace = self.caller.namespace;
-        let key =
-            |arithmetic: String| ContentKey::new(digest, &request.options, request.format, &arithmetic, namespace);
+        let key = |arithmetic: String| ContentKey::new(digest, request, &arithmetic, namespace);
         // Any backend may compute the file, and the key depends on the backend.
         let mut keys: Vec<ContentKey> = app.pool.file_arithmetics(&request.options).into_iter().map(key).collect();
         // A report has no validator.
@@ -217,8 +216,7 @@ impl MeshRequest {
             return delivery::report(&finished, timing);
         }
         // Another backend may have computed the mesh, with other bytes.
-        let key =
-            ContentKey::new(&digest, &request.options, format, &finished.product.report.file_arithmetic(), namespace);
+        let key = ContentKey::new(&digest, &request, &finished.product.report.file_arithmetic(), namespace);
         let is_stored = results::save_later(&app, &finished, format, &key);
         // The current file, one of several possible ones, is known only now.
         conditional::check_match(&headers, &delivery::etag(&key))?;
@@ -238,8 +236,7 @@ impl MeshRequest {
             input: loaded.input.clone(),
             digest: loaded.digest,
             namespace: self.caller.namespace,
-            strict: self.parsed.request.strict,
-            options: self.parsed.request.options.clone(),
+            request: self.parsed.request.clone(),
             rank: self.preferences.rank,
             reservation: Some(Arc::clone(&loaded.reservation)),
             parent: SpanParent::current(),
@@ -272,13 +269,12 @@ impl MeshRequest {
             *loaded = self.parsed.source.load(&self.app, &self.caller).await?;
         }
         let Input::File(file) = loaded.input.clone() else { return Err(Problem::internal("a file was not loaded")) };
-        let ParsedRequest { pairs, map, request, .. } = &self.parsed;
+        let ParsedRequest { pairs, map, .. } = &self.parsed;
         Ok(JobSpec {
             task: self.task(loaded),
             file,
-            map: map.as_ref().map(|map| (map.digest, map.bytes.clone())),
+            map: map.clone(),
             parameters: pairs.clone(),
-            format: request.format,
             idempotency_key: self.preferences.idempotency_key.clone(),
             batch: None,
         })

@@ -6,7 +6,7 @@ use axum::http::header::HeaderMap;
 use axum::http::request::Parts;
 
 use super::content_type::{DeclaredType, contradiction};
-use super::form::{UploadedFile, UploadedMap};
+use super::form::UploadedFile;
 use super::guard::Caller;
 use super::problem::Problem;
 use super::problem_types::ProblemType;
@@ -14,6 +14,7 @@ use super::source::{Loaded, StructureSource};
 use super::state::{App, Shared};
 use super::{json_body, negotiate, upload};
 use crate::formats::Format;
+use crate::jobs::UploadedMap;
 use crate::pipeline::MapFile;
 use crate::pipeline::params::{self, Request};
 use crate::structure::detect_format;

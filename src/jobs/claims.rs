@@ -44,7 +44,7 @@ impl JobStore {
     pub(super) fn queue_full(&self, task: &Task) -> Refusal {
         let (waiting, limit, pool) = (self.0.broker.queued(), self.0.broker.limit(), &self.0.pool);
         // As if the jobs ahead took as long as this one.
-        let expected = pool.expected(&task.input, &task.options).as_secs_f64();
+        let expected = pool.expected(&task.input, &task.request.options).as_secs_f64();
         let ahead = Duration::try_from_secs_f64(expected * waiting as f64 / pool.settings().workers as f64);
         let wait = pool.estimated_wait(Lane::Batch).saturating_add(ahead.unwrap_or(Duration::MAX));
         Refusal::QueueFull { waiting, limit, wait }

@@ -21,8 +21,9 @@ use crate::telemetry::TraceSpan;
 /// Returns the identity of the work of a task: namespace, input, parameters and strictness. Tasks with equal keys share
 /// one job.
 pub(super) fn work_key(task: &Task) -> Digest {
-    let Task { namespace, strict, digest, .. } = task;
-    Digest::of(format!("{namespace}\n{strict}\n{}\n{digest}\n", params::canonical(&task.options)).as_bytes())
+    let Task { namespace, request, digest, .. } = task;
+    let parameters = params::canonical(&request.options);
+    Digest::of(format!("{namespace}\n{}\n{parameters}\n{digest}\n", request.strict).as_bytes())
 }
 
 /// Progress of a job, written by its worker.

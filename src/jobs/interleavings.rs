@@ -61,7 +61,7 @@ fn join(workers: Vec<JoinHandle<()>>) {
 
 #[test]
 fn every_waiting_request_gets_an_outcome_although_others_leave() {
-    shuttle::check_random(
+    crate::sync::explore(
         || {
             let (queue, runs) = (Arc::new(Queue::new(8, 2)), Arc::default());
             let workers = workers(&queue, &runs);
@@ -87,7 +87,7 @@ fn every_waiting_request_gets_an_outcome_although_others_leave() {
 
 #[test]
 fn jobs_that_move_to_the_long_lane_end_although_others_leave_and_the_service_stops() {
-    shuttle::check_random(
+    crate::sync::explore(
         || {
             let (queue, runs) = (Arc::new(Queue::new(8, 1)), Arc::default());
             let workers = workers(&queue, &runs);
@@ -116,7 +116,7 @@ fn jobs_that_move_to_the_long_lane_end_although_others_leave_and_the_service_sto
 
 #[test]
 fn no_request_waits_for_ever_when_the_service_stops() {
-    shuttle::check_random(
+    crate::sync::explore(
         || {
             let (queue, runs) = (Arc::new(Queue::new(8, 2)), Arc::default());
             let workers = workers(&queue, &runs);
@@ -140,7 +140,7 @@ fn no_request_waits_for_ever_when_the_service_stops() {
 
 #[test]
 fn durable_jobs_run_or_are_left_to_the_next_process() {
-    shuttle::check_random(
+    crate::sync::explore(
         || {
             let (queue, runs) = (Arc::new(Queue::new(8, 2)), Arc::default());
             let workers = workers(&queue, &runs);

@@ -24,12 +24,11 @@ use super::record::{JobId, JobRecord, Requester, Status, now_ms};
 use super::records::existing;
 use super::runner::Runner;
 use super::runs::Runs;
-use super::{AcceptError, ContentKey, EndError, OnStart, Pool, SaveError, Task, Ticket, results};
+use super::{AcceptError, ContentKey, EndError, OnStart, Pool, SaveError, Task, Ticket, UploadedMap, results};
 use crate::config::JobsConfig;
-use crate::formats::Format;
 use crate::pipeline::suits_gpu;
 use crate::single_flight::SingleFlight;
-use crate::store::{Digest, Namespace, Pin, Secret, Store, StoreError};
+use crate::store::{Namespace, Pin, Secret, Store, StoreError};
 use crate::sync::{Handle, timeout};
 
 /// Maximum time that the acceptance of a job whose result is stored waits for its end to be recorded.
@@ -46,12 +45,10 @@ pub(crate) struct JobSpec {
     pub(crate) task: Task,
     /// Structure file of the task.
     pub(crate) file: Bytes,
-    /// Map of the task, with its digest.
-    pub(crate) map: Option<(Digest, Bytes)>,
+    /// Map of the task.
+    pub(crate) map: Option<UploadedMap>,
     /// Parameters as the client wrote them.
     pub(crate) parameters: Vec<(String, String)>,
-    /// Mesh format.
-    pub(crate) format: Format,
     /// Idempotency key of the request.
     pub(crate) idempotency_key: Option<String>,
     /// Batch of the job.
@@ -178,13 +175,13 @@ impl JobStore {
             id: id.clone(),
             namespace,
             input: spec.task.digest,
-            map: spec.map.as_ref().map(|(digest, _)| *digest),
+            map: spec.map.as_ref().map(|map| map.digest),
             parameters: spec.parameters,
-            format: spec.format.name().to_owned(),
+            format: spec.task.request.format.name().to_owned(),
             client,
             batch: spec.batch,
             urgency: spec.task.rank.urgency,
-            suits_gpu: suits_gpu(spec.task.input.atoms(), &spec.task.options),
+            suits_gpu: suits_gpu(spec.task.input.atoms(), &spec.task.request.options),
             status: Status::Accepted,
             attempts: u32::from(ticket.is_some()),
             memory_waits: 0,
@@ -203,7 +200,7 @@ impl JobStore {
         // Its pin keeps the result until the job has ended.
         let stored = match &ticket {
             Some(_) => None,
-            None => self.stored_result(&spec.task, spec.format).await?,
+            None => self.stored_result(&spec.task).await?,
         };
         let is_dispatched = ticket.is_none() && stored.is_none();
         if let Some(why) = inner.broker.down().filter(|_| is_dispatched) {
@@ -218,8 +215,8 @@ impl JobStore {
         let pins = inner.pins(&record);
         let reservation = inner.admit(&id).await?;
         inner.store.put_input(&record.input, namespace, spec.file).await?;
-        if let Some((digest, bytes)) = spec.map {
-            inner.store.put_input(&digest, namespace, bytes).await?;
+        if let Some(map) = spec.map {
+            inner.store.put_input(&map.digest, namespace, map.bytes).await?;
         }
         if !inner.write_new(&record).await?
             && let Some(view) = self.view(&id, namespace).await?
@@ -250,12 +247,13 @@ impl JobStore {
     }
 
     /// Returns the key of a task's result, pinned, if it is stored. Strict tasks always run.
-    pub(super) async fn stored_result(&self, task: &Task, format: Format) -> Result<Option<(String, Pin)>, StoreError> {
-        let arithmetics = if task.strict { Vec::new() } else { self.0.pool.file_arithmetics(&task.options) };
+    pub(super) async fn stored_result(&self, task: &Task) -> Result<Option<(String, Pin)>, StoreError> {
+        let Task { request, digest, namespace, .. } = task;
+        let arithmetics = if request.strict { Vec::new() } else { self.0.pool.file_arithmetics(&request.options) };
         for arithmetic in arithmetics {
-            let key = ContentKey::new(&task.digest, &task.options, format, &arithmetic, task.namespace);
-            let pin = self.0.store.pin(&key.name(format.name())?);
-            if results::is_stored(&self.0.store, format, &key).await? {
+            let key = ContentKey::new(digest, request, &arithmetic, *namespace);
+            let pin = self.0.store.pin(&key.name(request.format.name())?);
+            if results::is_stored(&self.0.store, request.format, &key).await? {
                 return Ok(Some((key.to_string(), pin)));
             }
         }

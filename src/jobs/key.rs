@@ -2,8 +2,8 @@
 
 use std::fmt;
 
-use crate::formats::Format;
-use crate::pipeline::{Options, algorithm_versions, params};
+use crate::pipeline::algorithm_versions;
+use crate::pipeline::params::{self, Request};
 use crate::store::{BadDigest, Digest, Name, Namespace, StoreError};
 
 /// Name of a mesh file, with the namespace in which it is stored. Equal names mean equal bytes in every namespace.
@@ -16,13 +16,8 @@ pub(crate) struct ContentKey {
 impl ContentKey {
     /// Returns the key of a result. `arithmetic` names the arithmetic of the backend, followed by that of a picture's
     /// renderer. Releases with the same algorithms give the same keys.
-    pub(crate) fn new(
-        input: &Digest,
-        options: &Options,
-        format: Format,
-        arithmetic: &str,
-        namespace: Namespace,
-    ) -> Self {
+    pub(crate) fn new(input: &Digest, request: &Request, arithmetic: &str, namespace: Namespace) -> Self {
+        let Request { options, format, .. } = request;
         let (canonical, versions) = (params::canonical(options), algorithm_versions::file_versions(options));
         let text = format!("molmesh {versions}\n{arithmetic}\n{}\n{canonical}\n{input}\n", format.name());
         Self { digest: Digest::of(text.as_bytes()), namespace }
@@ -52,27 +47,27 @@ mod tests {
 
     #[test]
     fn different_results_have_different_keys() {
-        let plain = Options::default();
-        let fine = params::parse([("resolution", "0.4")]).unwrap().options;
-        let chain = params::parse([("chains", "A")]).unwrap().options;
-        let png = params::parse([("format", "png")]).unwrap().options;
-        let wide = params::parse([("format", "png"), ("width", "600")]).unwrap().options;
+        let parse = |pairs: &[(&str, &str)]| params::parse(pairs.iter().copied()).unwrap();
+        let plain = parse(&[]);
+        let ply = parse(&[("format", "ply")]);
+        let fine = parse(&[("resolution", "0.4")]);
+        let chain = parse(&[("chains", "A")]);
+        let png = parse(&[("format", "png")]);
+        let wide = parse(&[("format", "png"), ("width", "600")]);
         let (a, b) = (Digest::of(b"a"), Digest::of(b"b"));
-        let key = |input, options, format, arithmetic| {
-            ContentKey::new(input, options, format, arithmetic, Namespace::default())
-        };
+        let key = |input, request, arithmetic| ContentKey::new(input, request, arithmetic, Namespace::default());
         let mut keys = vec![
-            key(&a, &plain, Format::Glb, "cpu"),
-            key(&b, &plain, Format::Glb, "cpu"),
-            key(&a, &fine, Format::Glb, "cpu"),
-            key(&a, &chain, Format::Glb, "cpu"),
-            key(&a, &plain, Format::Ply, "cpu"),
-            key(&a, &plain, Format::Glb, "gpu"),
-            key(&a, &png, Format::Png, "cpu+cpu"),
-            key(&a, &png, Format::Png, "cpu+gpu"),
-            key(&a, &wide, Format::Png, "cpu+cpu"),
+            key(&a, &plain, "cpu"),
+            key(&b, &plain, "cpu"),
+            key(&a, &fine, "cpu"),
+            key(&a, &chain, "cpu"),
+            key(&a, &ply, "cpu"),
+            key(&a, &plain, "gpu"),
+            key(&a, &png, "cpu+cpu"),
+            key(&a, &png, "cpu+gpu"),
+            key(&a, &wide, "cpu+cpu"),
         ];
-        assert_eq!(keys[0], key(&a, &Options::default(), Format::Glb, "cpu"));
+        assert_eq!(keys[0], key(&a, &parse(&[("format", "glb")]), "cpu"));
         keys.sort_by_key(ToString::to_string);
         keys.dedup();
         assert_eq!(keys.len(), 9);

@@ -1,8 +1,7 @@
 //! The worker pool: a bounded queue in front of one backend, with worker threads of its own, and durable jobs on top.
 //!
-//! The result of a [`Task`] (structure bytes and a [`crate::pipeline::Options`]) is a mesh with its report. Deadlines,
-//! cancellation and panics are handled here, so callers only wait for a [`Ticket`]. This module knows no HTTP and no
-//! graphics API.
+//! The result of a [`Task`] (a structure and a [`Request`]) is a mesh with its report. Deadlines, cancellation and
+//! panics are handled here, so callers only wait for a [`Ticket`]. This module knows no HTTP and no graphics API.
 //!
 //! `queue` holds `coalesced_job`s: identical requests share one. `job_store` keeps `durable_job`s, whose `records`
 //! survive the process. A `batch` is a list of durable jobs.
@@ -60,7 +59,10 @@ pub(crate) use ticket::Ticket;
 
 use std::sync::Arc;
 
-use crate::pipeline::{Options, Product};
+use bytes::Bytes;
+
+use crate::pipeline::Product;
+use crate::pipeline::params::Request;
 use crate::store::{Digest, Namespace};
 use crate::structure::strict_validator::Diagnostic;
 use crate::telemetry::SpanParent;
@@ -74,10 +76,8 @@ pub(crate) struct Task {
     pub(crate) digest: Digest,
     /// Namespace of input and result. Only tasks of one namespace share work.
     pub(crate) namespace: Namespace,
-    /// Run the strict validator as well, and reject a file in which it finds errors.
-    pub(crate) strict: bool,
-    /// Parameters of the mesh.
-    pub(crate) options: Options,
+    /// Parameters and format. If `strict`, the strict validator also runs, and a file with errors is rejected.
+    pub(crate) request: Request,
     /// Client and priority.
     pub(crate) rank: Rank,
     /// Memory budget that `input` is charged to.
@@ -86,6 +86,15 @@ pub(crate) struct Task {
     pub(crate) parent: SpanParent,
     /// Id of the durable job; `None` for an interactive request.
     pub(crate) id: Option<JobId>,
+}
+
+/// Map file of a request.
+#[derive(Debug, Clone)]
+pub(crate) struct UploadedMap {
+    /// Content.
+    pub(crate) bytes: Bytes,
+    /// SHA-256 of `bytes`.
+    pub(crate) digest: Digest,
 }
 
 /// Result of a job.

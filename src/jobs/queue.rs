@@ -35,7 +35,7 @@ struct TaskWork {
 
 impl TaskWork {
     fn of(task: &Task) -> Self {
-        let units = pipeline::estimate_work(task.input.atoms(), &task.options);
+        let units = pipeline::estimate_work(task.input.atoms(), &task.request.options);
         Self { key: work_key(task), units, lane: Lane::of(&task.rank, units) }
     }
 }
@@ -98,7 +98,7 @@ impl QueueState {
             rank: task.rank,
             lane,
             units,
-            is_tile: task.options.tile.is_some(),
+            is_tile: task.request.options.tile.is_some(),
             tag: 0.0,
             accepted: now,
             begun: None,

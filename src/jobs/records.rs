@@ -21,7 +21,6 @@ use super::rank::{Client, Rank};
 use super::record::{BadRecord, JobId, JobRecord, decode};
 use super::retry::retry;
 use super::{AcceptError, Input, JobView, Task};
-use crate::formats::Format;
 use crate::store::{Name, Pin, RecordReservation, StoreError};
 use crate::sync::timeout;
 use crate::telemetry::{JOBS_RECOVERED, shorten};
@@ -187,20 +186,17 @@ pub(super) fn existing(record: &JobRecord, view: JobView) -> Result<JobView, Acc
 
 impl JobStore {
     /// Returns the task of a record, without its input.
-    pub(super) fn task_of(&self, record: &JobRecord) -> Result<(Task, Format), String> {
-        let request = record.request()?;
-        let task = Task {
+    pub(super) fn task_of(&self, record: &JobRecord) -> Result<Task, String> {
+        Ok(Task {
             input: Input::File(Bytes::new()),
             digest: record.input,
             namespace: record.namespace,
-            strict: request.strict,
-            options: request.options,
+            request: record.request()?,
             rank: Rank { client: Client(record.client), batch: true, urgency: record.urgency },
             reservation: None,
             parent: record.requester.parent(&self.0.pool.settings().tracer),
             id: Some(record.id.clone()),
-        };
-        Ok((task, request.format))
+        })
     }
 
     /// Dispatches the unfinished jobs that neither the broker nor this process has, such as those of an earlier

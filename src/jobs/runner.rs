@@ -16,8 +16,8 @@ use super::results::{self, SaveError};
 use super::retry::{self, retry};
 use super::runs::{Phase, RunEnd};
 use super::{ContentKey, EndError, Failure, Finished, Input, Refusal, Task, Ticket};
-use crate::formats::Format;
-use crate::pipeline::{MapFile, Options};
+use crate::pipeline::MapFile;
+use crate::pipeline::params::Request;
 use crate::store::{Digest, Name, Pin, StoreError};
 use crate::surface::OutOfMemory;
 use crate::sync::{Handle, sleep};
@@ -174,8 +174,8 @@ impl Runner {
     async fn attempt(&mut self) -> Result<(String, Pin), NoResult> {
         let (jobs, job) = (&self.jobs, &self.owned.job);
         let (record, pool, broker) = (job.record(), &jobs.0.pool, &jobs.0.broker);
-        let (task, format) = jobs.task_of(&record).map_err(|why| EndError::Lost { why })?;
-        let (options, work) = (task.options.clone(), work_key(&task));
+        let task = jobs.task_of(&record).map_err(|why| EndError::Lost { why })?;
+        let (request, work) = (task.request.clone(), work_key(&task));
         // Held until the result is stored.
         let (mut ticket, _lock) = if let Some(mut ticket) = self.ticket.take() {
             ticket.is_durable = true;
@@ -188,7 +188,7 @@ impl Runner {
             } else {
                 let lock = broker.lock(&work).await.ok_or(NoResult::Locked)?;
                 // An earlier process may have ended between storing the result and updating the record.
-                if let Some(stored) = jobs.stored_result(&task, format).await? {
+                if let Some(stored) = jobs.stored_result(&task).await? {
                     return Ok(stored);
                 }
                 // Without the lock, the last attempt may still run on another node.
@@ -224,7 +224,7 @@ impl Runner {
             Err(failure) => return Err(EndError::from(failure).into()),
         };
         jobs.publish_progress(job, "encode", 0.95);
-        let saved = save(jobs, &record, &options, format, finished).await;
+        let saved = save(jobs, &record, &request, finished).await;
         saved.map_err(|error| match error {
             // The mesh is not held for ever. It is computed again while attempts are left.
             EndError::Save { error, .. } if error.is_temporary() && job.record().attempts < jobs.0.config.attempts => {
@@ -239,13 +239,12 @@ impl Runner {
 async fn save(
     jobs: &JobStore,
     record: &JobRecord,
-    options: &Options,
-    format: Format,
+    request: &Request,
     finished: Arc<Finished>,
 ) -> Result<(String, Pin), EndError> {
-    let report = &finished.product.report;
+    let (report, format) = (&finished.product.report, request.format);
     let resolution = report.resolution;
-    let key = ContentKey::new(&record.input, options, format, &report.file_arithmetic(), record.namespace);
+    let key = ContentKey::new(&record.input, request, &report.file_arithmetic(), record.namespace);
     let parent = record.requester.parent(&jobs.0.pool.settings().tracer);
     let span = TraceSpan::start(&parent, "save", SpanKind::Internal, Instant::now());
     let failed = |error| EndError::Save { error, resolution };
@@ -279,7 +278,7 @@ impl JobStore {
         };
         task.input = Input::File(load(task.digest).await?);
         if let Some(digest) = map {
-            task.options.map = Some(MapFile::new(digest.to_string(), load(digest).await?));
+            task.request.options.map = Some(MapFile::new(digest.to_string(), load(digest).await?));
         }
         task.reservation = Some(Arc::new(reservation));
         Ok(task)

@@ -15,7 +15,7 @@ use super::rank::Client;
 use super::{MemoryReservation, ScratchSpace};
 use crate::memory_budget::{Budget, Reclaim};
 use crate::pipeline::tileset::{self, StreamSource, StructureStream, Tileset};
-use crate::pipeline::{JobError, Options, StageClock};
+use crate::pipeline::{JobError, Options, StageClock, WorkScope};
 use crate::store::Digest;
 use crate::structure::stream::{BLOCK_BYTES, ScratchFile};
 use crate::structure::{self, ReadLimits, StructureError};
@@ -146,7 +146,7 @@ impl Structures {
         let keys = tileset_keys(key, options);
         let in_memory = |limits: &ReadLimits| {
             let read = |control: &Control<'_>| self.get(key, input, limits, control);
-            let prepare = |control: &Control<'_>| Tileset::new(read, options, limits, control, clock);
+            let prepare = |control: &Control<'_>| Tileset::new(read, options, limits, &WorkScope::new(clock, control));
             self.made(keys[0], input, control, &self.budget.part(self.limit), prepare)
         };
         let on_disk = |scratch: &ScratchSpace| {
@@ -220,7 +220,7 @@ impl Structures {
         let block_bytes = usize::try_from(self.limit / BLOCKS).unwrap_or(usize::MAX).clamp(MIN_BLOCK, BLOCK_BYTES);
         let scratch = [scratch.file()?, scratch.file()?];
         let stream = StructureStream { source, scratch, block_bytes, began: &|_| {} };
-        let tileset = Tileset::of_stream(stream, options, limits, control, clock)?;
+        let tileset = Tileset::of_stream(stream, options, limits, &WorkScope::new(clock, control))?;
         drop(copy);
         let reservation = Arc::new(self.budget.reservation());
         Ok(tileset.with_structure(|structure| self.charged(*structure, input, reservation)))

@@ -24,7 +24,6 @@ use super::{
     Status, Task,
 };
 use crate::config::JobsConfig;
-use crate::formats::Format;
 use crate::pipeline::params;
 use crate::store::faulty::{Faults, faulty_in};
 use crate::store::{Digest, Folder, Name, Namespace, Store, StoreError};
@@ -78,8 +77,8 @@ impl Fixture {
 
     async fn accept_from(&self, client: &str) -> Result<JobView, AcceptError> {
         let (task, parameters) = (task(client, "2"), vec![("resolution".to_owned(), "2".to_owned())]);
-        let (file, format) = (Bytes::from_static(SAMPLE), Format::Stl);
-        let spec = JobSpec { task, file, map: None, parameters, format, idempotency_key: None, batch: None };
+        let file = Bytes::from_static(SAMPLE);
+        let spec = JobSpec { task, file, map: None, parameters, idempotency_key: None, batch: None };
         self.jobs.accept(spec, None).await
     }
 
@@ -139,8 +138,7 @@ impl Task {
             digest: Digest::of(&file),
             input: Input::File(file),
             namespace: Namespace::default(),
-            strict: false,
-            options: params::parse(parameters.iter().copied()).unwrap().options,
+            request: params::parse(parameters.iter().copied()).unwrap(),
             rank,
             reservation: None,
             parent: SpanParent::default(),
@@ -152,7 +150,7 @@ impl Task {
 /// Returns a task of a client.
 fn task(client: &str, resolution: &str) -> Task {
     let rank = Rank { client: Client::named(client), batch: true, ..Rank::default() };
-    Task::for_test(Bytes::from_static(SAMPLE), &[("resolution", resolution)], rank)
+    Task::for_test(Bytes::from_static(SAMPLE), &[("resolution", resolution), ("format", "stl")], rank)
 }
 
 fn new_id() -> JobId {
@@ -389,8 +387,8 @@ async fn tiles_do_not_change_the_estimated_duration_of_jobs() {
     let fixture = Fixture::new(1, Duration::ZERO).await;
     let pool = &fixture.jobs.0.pool;
     let run = async |pairs: &[(&str, &str)]| {
-        let options = params::parse(pairs.iter().copied()).unwrap().options;
-        let mut ticket = pool.submit(Task { options, ..task("a", "2") }, MAX_WAIT, None).unwrap();
+        let request = params::parse(pairs.iter().copied()).unwrap();
+        let mut ticket = pool.submit(Task { request, ..task("a", "2") }, MAX_WAIT, None).unwrap();
         assert!(ticket.wait().await.is_ok());
         pool.seconds(1.0)
     };

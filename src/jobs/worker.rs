@@ -13,6 +13,7 @@ use super::pool::WorkerContext;
 use super::rank::Lane;
 use super::{Failure, Finished, JobId, MemoryReservation, OnStart, Outcome, Settings, Task};
 use crate::formats::Pieces;
+use crate::pipeline::params::Request;
 use crate::pipeline::{self, Choice, JobError, Product, ProgressSink, Report, StageClock, WorkScope};
 use crate::structure::strict_validator::{self, Diagnostic, Level, MAX_UNREAD_BYTES};
 use crate::structure::{ReadLimits, StructureError};
@@ -61,18 +62,18 @@ fn run(shared: &WorkerContext, entry: QueuedTask) -> Result<Option<Outcome>, Res
         // The memory for drawing is known in advance: reserved now, jobs do not fail at their end for lack of it.
         // Reading notes the file and the map.
         drawing.also_held(input_bytes(&task));
-        drawing.grow(task.options.picture.map_or(0, |picture| picture.bytes()))?;
+        drawing.grow(task.request.options.picture.map_or(0, |picture| picture.bytes()))?;
         reservation.also_held(drawing.bytes());
         let control = Control {
             cancel: cancel.clone(),
             memory: Arc::<MemoryReservation>::clone(&reservation),
             ..Control::default()
         };
-        let choice = shared.choice(&task.input, &task.options);
+        let choice = shared.choice(&task.input, &task.request.options);
         let work = || {
             OnStart::run_all(on_start);
             let file = task.input.file();
-            let (diagnostics, checked) = if task.strict {
+            let (diagnostics, checked) = if task.request.strict {
                 let begun = Instant::now();
                 let found = check(shared, &task, &control);
                 progress.ended("check", begun, begun.elapsed());
@@ -82,7 +83,7 @@ fn run(shared: &WorkerContext, entry: QueuedTask) -> Result<Option<Outcome>, Res
             };
             let mut product = product(shared, &task, &choice, &control, progress.as_ref())
                 .map_err(|error| explained(shared, file, error, &control))?;
-            if let Some(picture) = &task.options.picture {
+            if let Some(picture) = &task.request.options.picture {
                 pipeline::draw(&mut product, picture, &shared.settings.renderer, &control, progress.as_ref())?;
             }
             if let Some(time) = checked {
@@ -131,18 +132,14 @@ fn product(
     control: &Control<'_>,
     progress: &dyn ProgressSink,
 ) -> Result<Product, JobError> {
-    let (Task { namespace, digest, input, options, .. }, Settings { structures, limits, .. }) =
-        (task, &shared.settings);
+    let Task { namespace, digest, input, request: Request { options, .. }, .. } = task;
+    let Settings { structures, limits, .. } = &shared.settings;
     if options.tile.is_some() && !options.selection.instances {
         let clock = StageClock::new(progress);
         let (tileset, colors) =
             structures.tileset((*namespace, *digest), input, options, &limits.read, control, &clock)?;
-        return tileset.product(
-            (options, colors.as_deref()),
-            choice,
-            &limits.surface,
-            &WorkScope::new(&clock, control),
-        );
+        let scope = WorkScope::new(&clock, control);
+        return tileset.product(options, colors.as_deref(), choice, &limits.surface, &scope);
     }
     let read = |control: &Control<'_>| structures.get((*namespace, *digest), input, &limits.read, control);
     pipeline::run_with(read, options, limits, choice, control, progress, None)
@@ -229,7 +226,7 @@ fn count(report: &Report) {
 
 /// Returns the size of the file and the map of a task, bytes.
 fn input_bytes(task: &Task) -> u64 {
-    let map = task.options.map.as_ref().map_or(0, |map| map.as_ref().len());
+    let map = task.request.options.map.as_ref().map_or(0, |map| map.as_ref().len());
     (task.input.file().map_or(0, Bytes::len) + map) as u64
 }
 

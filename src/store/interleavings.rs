@@ -109,7 +109,7 @@ async fn check(store: &Store, capacity: u64) {
 
 #[test]
 fn pinned_objects_stay_and_the_index_agrees_with_the_objects() {
-    shuttle::check_random(
+    crate::sync::explore(
         || {
             let store = block_on(open(2));
             let start = |work: fn(Store)| {
@@ -146,7 +146,7 @@ fn pinned_objects_stay_and_the_index_agrees_with_the_objects() {
 
 #[test]
 fn a_store_full_of_pinned_objects_refuses_and_recovers() {
-    shuttle::check_random(
+    crate::sync::explore(
         || {
             let store = block_on(open(1));
             let pin = store.pin(&name(1));

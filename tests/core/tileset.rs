@@ -60,8 +60,9 @@ fn tileset_options(pairs: &[(&str, &str)]) -> Options {
 fn tileset_of(file: &[u8], pairs: &[(&str, &str)]) -> Prepared {
     let options = tileset_options(pairs);
     let read = |control: &Control<'_>| structure::read_with(file, &ReadLimits::default(), control).map(Box::new);
-    let tileset =
-        Tileset::new(read, &options, &ReadLimits::default(), &Control::default(), &StageClock::new(&())).unwrap();
+    let clock = StageClock::new(&());
+    let scope = WorkScope::new(&clock, &Control::default());
+    let tileset = Tileset::new(read, &options, &ReadLimits::default(), &scope).unwrap();
     Prepared { tileset, options }
 }
 
@@ -168,8 +169,8 @@ fn too_many_tiles_are_rejected() {
     let options = |resolution| params::parse([("radius_offset", "10"), ("resolution", resolution)]).unwrap().options;
     let read = |control: &Control<'_>| structure::read_with(SAMPLE, &ReadLimits::default(), control).map(Box::new);
     let clock = StageClock::new(&());
-    let new =
-        |resolution| Tileset::new(read, &options(resolution), &ReadLimits::default(), &Control::default(), &clock);
+    let scope = WorkScope::new(&clock, &Control::default());
+    let new = |resolution| Tileset::new(read, &options(resolution), &ReadLimits::default(), &scope);
     let Err(JobError::Surface(SurfaceError::Limit(error))) = new("0.01") else { panic!("accepted") };
     assert_eq!(error.limit, Limit::Tiles);
     assert!(new("0.2").is_ok_and(|tileset| (tileset.tiles().len() as u64) < error.max));

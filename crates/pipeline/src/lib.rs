@@ -296,9 +296,9 @@ pub fn run_with<S: Deref<Target = Structure>>(
         let assembly = AssemblyTileset::new(read, options, &limits.read, &scope)?;
         return assembly.root(options, limits, choice, &scope);
     }
-    let tileset = Tileset::new(read, options, &limits.read, control, &clock)?;
+    let tileset = Tileset::new(read, options, &limits.read, &scope)?;
     let colors = options.color.map(|coloring| tileset.colors(coloring, control)).transpose()?;
-    tileset.product((options, colors.as_ref()), choice, &limits.surface, &scope)
+    tileset.product(options, colors.as_ref(), choice, &limits.surface, &scope)
 }
 
 /// Runs a job on selected spheres of a structure.

@@ -102,7 +102,7 @@ fn explore(returns_early: bool) {
         }
         assert_eq!(counts.len() as u64, JOBS);
     };
-    shuttle::check_random(model, SCHEDULES);
+    crate::sync::explore(model, SCHEDULES);
 }
 
 #[test]

@@ -11,7 +11,6 @@ use object_store::path::Path;
 use serde_json::Value;
 use shuttle::future::block_on;
 use shuttle::rand::{Rng as _, thread_rng};
-use shuttle::scheduler::RandomScheduler;
 
 use super::super::coalesced_job::QueuedTask;
 use super::super::queue::Queue;
@@ -22,7 +21,6 @@ use super::super::{
 };
 use super::task;
 use crate::config::JobsConfig;
-use crate::formats::Format;
 use crate::store::interleavings::open_bytes;
 use crate::store::{Digest, Name, Namespace, Store};
 use crate::surface::{OutOfMemory, ReferenceBackend};
@@ -30,8 +28,6 @@ use crate::sync::thread::{self, JoinHandle};
 
 /// Number of schedules of a test. Each has a hundred times the steps of a test of the queue.
 const SCHEDULES: usize = 3000;
-/// Stack of a thread, bytes: those of the scheduler are too small for nested futures.
-const STACK: usize = 1 << 20;
 /// Idempotency key of every request.
 const KEY: &str = "k";
 /// Number of attempts after which a job fails.
@@ -72,7 +68,6 @@ impl Fixture {
             map: None,
             file: Bytes::from(vec![1]),
             parameters: Vec::new(),
-            format: Format::Glb,
             idempotency_key: Some(KEY.to_owned()),
             batch: None,
         };
@@ -97,9 +92,8 @@ impl Fixture {
 
     /// Stores a result of the job.
     fn store_result(&self, entry: &QueuedTask) {
-        let arithmetic = self.jobs.0.pool.file_arithmetics(&entry.task.options).remove(0);
-        let key =
-            ContentKey::new(&entry.task.digest, &entry.task.options, Format::Glb, &arithmetic, Namespace::default());
+        let arithmetic = self.jobs.0.pool.file_arithmetics(&entry.task.request.options).remove(0);
+        let key = ContentKey::new(&entry.task.digest, &entry.task.request, &arithmetic, Namespace::default());
         let report = results::report_file(b"{}".to_vec(), 0, Digest::of(b"")).unwrap();
         for (extension, bytes) in [("glb", Bytes::new()), (REPORT, report)] {
             block_on(self.store.put(&key.name(extension).unwrap(), bytes)).unwrap();
@@ -219,8 +213,6 @@ fn id() -> JobId {
 /// Explores schedules of clients that create, read and sometimes cancel one job while two workers run it. Returns the
 /// names of all ends.
 fn explore(cancel: fn(&mut Client<'_>)) -> BTreeSet<&'static str> {
-    let mut config = shuttle::Config::new();
-    config.stack_size = STACK;
     let ends = Arc::<std::sync::Mutex<BTreeSet<_>>>::default();
     let of_model = Arc::clone(&ends);
     let model = move || {
@@ -251,7 +243,7 @@ fn explore(cancel: fn(&mut Client<'_>)) -> BTreeSet<&'static str> {
         let end = fixture.check(workers);
         of_model.lock().unwrap().insert(end.name());
     };
-    shuttle::Runner::new(RandomScheduler::new(SCHEDULES), config).run(model);
+    crate::sync::explore(model, SCHEDULES);
     let ends = ends.lock().unwrap();
     ends.clone()
 }
@@ -270,8 +262,6 @@ fn an_end_that_is_visible_before_it_is_on_record_is_detected() {
 
 /// Explores schedules of a stop while two workers run a job. Returns the names of all states after it.
 fn explore_stops(stop: fn(&JobStore)) -> BTreeSet<&'static str> {
-    let mut config = shuttle::Config::new();
-    config.stack_size = STACK;
     let states = Arc::<std::sync::Mutex<BTreeSet<_>>>::default();
     let of_model = Arc::clone(&states);
     let model = move || {
@@ -291,7 +281,7 @@ fn explore_stops(stop: fn(&JobStore)) -> BTreeSet<&'static str> {
         assert!(!is_counted, "a stop counts an attempt: {record:?}");
         of_model.lock().unwrap().insert(record.status.name());
     };
-    shuttle::Runner::new(RandomScheduler::new(SCHEDULES), config).run(model);
+    crate::sync::explore(model, SCHEDULES);
     let states = states.lock().unwrap();
     states.clone()
 }

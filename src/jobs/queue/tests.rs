@@ -19,7 +19,7 @@ fn task(content: u8) -> Task {
 /// Returns the expected duration of the task.
 fn expected(queue: &Queue) -> Duration {
     let task = task(0);
-    Duration::from_secs_f64(queue.expected(crate::pipeline::estimate_work(task.input.atoms(), &task.options)))
+    Duration::from_secs_f64(queue.expected(crate::pipeline::estimate_work(task.input.atoms(), &task.request.options)))
 }
 
 #[test]

@@ -10,7 +10,6 @@ use tempfile::TempDir;
 
 use super::{MAX_WAIT, SAMPLE, ended, is, stops, task, until};
 use crate::config::{JobsConfig, StoreConfig};
-use crate::formats::Format;
 use crate::jobs::broker::tests::{bounded, nats, on_nats};
 use crate::jobs::{
     Broker, Budget, EndError, JobId, JobSpec, JobStore, MemoryBroker, NatsBroker, Pool, Settings, Status,
@@ -45,7 +44,6 @@ impl Node {
             file: Bytes::from_static(SAMPLE),
             map: None,
             parameters: vec![("resolution".to_owned(), resolution.to_owned())],
-            format: Format::Stl,
             idempotency_key: key.map(str::to_owned),
             batch: None,
         };

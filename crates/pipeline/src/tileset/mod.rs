@@ -88,15 +88,13 @@ impl<S: Deref<Target = Structure>> Tileset<S> {
         read: impl FnOnce(&Control<'_>) -> Result<S, StructureError>,
         options: &Options,
         limits: &ReadLimits,
-        control: &Control<'_>,
-        clock: &StageClock<'_>,
+        scope: &WorkScope<'_>,
     ) -> Result<Self, JobError> {
-        let scope = WorkScope::new(clock, control);
-        let LoadedStructure { structure, selected, spheres } = load(read, options, limits, &scope)?;
-        clock.time("index", || {
+        let LoadedStructure { structure, selected, spheres } = load(read, options, limits, scope)?;
+        scope.clock.time("index", || {
             let params = options.params_for(spheres.len());
             let layout = Layout::of(&spheres, &params)?;
-            let (levels, tiles) = layout.index(&Arc::new(spheres), &params, control)?;
+            let (levels, tiles) = layout.index(&Arc::new(spheres), &params, &scope.control)?;
             Ok(Self { structure, layout, levels, tiles, selected, streamed: None })
         })
     }
@@ -149,7 +147,8 @@ impl<S: Deref<Target = Structure>> Tileset<S> {
     /// Returns the errors of meshing and compression, and [`SurfaceError::BadParameter`] for a tile outside the cube.
     pub fn product(
         &self,
-        (options, colors): (&Options, Option<&TilesetColors>),
+        options: &Options,
+        colors: Option<&TilesetColors>,
         choice: &Choice<'_>,
         limits: &SurfaceLimits,
         scope: &WorkScope<'_>,

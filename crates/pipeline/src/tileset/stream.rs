@@ -21,7 +21,7 @@ use super::stored::{SphereIndex, SphereList, StoredSphere};
 use crate::color::{BlockColors, Scheme};
 use crate::load::SPHERE_BYTES;
 use crate::params::ParamError;
-use crate::{JobError, Options, StageClock, WorkScope};
+use crate::{JobError, Options, WorkScope};
 
 /// Buffer of the index, in blocks.
 const BUFFERED_BLOCKS: usize = 4;
@@ -182,9 +182,9 @@ impl Tileset<Box<Structure>> {
         stream: StructureStream<'_>,
         options: &Options,
         limits: &ReadLimits,
-        control: &Control<'_>,
-        clock: &StageClock<'_>,
+        scope: &WorkScope<'_>,
     ) -> Result<Self, JobError> {
+        let WorkScope { clock, control } = scope;
         let params = SurfaceParams { atom_ids: options.needs_atoms(), ..options.params.clone() };
         let [file, columns] = stream.scratch.map(|file| Arc::new(StoredBytes::new(file)));
         let mut side = bucket_side(CELLS * params.resolution);
@@ -205,10 +205,9 @@ impl Tileset<Box<Structure>> {
         let mut reader = BlockReader { options, limits, selected, colors, spheres, head: None, assemblies, memory };
         match stream.source {
             StreamSource::Files(files) => {
-                let scope = WorkScope::new(clock, control);
                 for (number, input) in files.into_iter().enumerate() {
                     (stream.began)(number);
-                    reader.read(input, stream.block_bytes, &columns, &scope)?;
+                    reader.read(input, stream.block_bytes, &columns, scope)?;
                 }
             }
             StreamSource::Structure(structure) => {
@@ -373,7 +372,7 @@ mod tests {
 
     use super::super::{TilesetReport, write, write_stream};
     use super::*;
-    use crate::{Choice, JobLimits, params};
+    use crate::{Choice, JobLimits, StageClock, params};
 
     const HEAD: &str = "data_x\n_struct.title 'Several copies'\nloop_\n_entity.id\n_entity.type\n1 polymer\n2 water\n\
                         loop_\n_struct_asym.id\n_struct_asym.entity_id\n";
@@ -592,7 +591,12 @@ mod tests {
                 block_bytes: 5000,
                 began: &|_| {},
             };
-            let made = Tileset::of_stream(stream, &options, limits, &Control::default(), &StageClock::new(&()));
+            let made = Tileset::of_stream(
+                stream,
+                &options,
+                limits,
+                &WorkScope::new(&StageClock::new(&()), &Control::default()),
+            );
             let expected = molmesh_structure::select_with(
                 &read(text.as_bytes(), limits).unwrap(),
                 &options.selection,

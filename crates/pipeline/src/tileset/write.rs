@@ -96,19 +96,20 @@ pub fn write<S: Deref<Target = Structure> + Sync>(
     write: impl Fn(&str, &[u8]) -> io::Result<()> + Sync,
 ) -> Result<TilesetReport, WriteError> {
     let clock = StageClock::new(progress);
+    let scope = WorkScope::new(&clock, control);
     let store = |path: &str, bytes: &[u8]| store(&write, path, bytes);
     if !options.selection.instances {
-        let tileset = Tileset::new(read, options, &limits.read, control, &clock)?;
+        let tileset = Tileset::new(read, options, &limits.read, &scope)?;
         return tileset.write(options, choice, &limits.surface, control, progress, store);
     }
-    let assembly = AssemblyTileset::new(read, options, &limits.read, &WorkScope::new(&clock, control))?;
+    let assembly = AssemblyTileset::new(read, options, &limits.read, &scope)?;
     let units = assembly.units();
     let mut all = TilesetReport::default();
     for (number, Unit { name, rows, operators, .. }) in (1..).zip(units) {
         // Releases all memory that is counted for the unit.
         let control = &control.metered();
         let (options, structure) = (assembly.unit_options(options, number), &**assembly.structure());
-        let tileset = Tileset::new(|_| Ok(structure), &options, &limits.read, control, &clock)?;
+        let tileset = Tileset::new(|_| Ok(structure), &options, &limits.read, &WorkScope::new(&clock, control))?;
         let part = Part { sink: progress, index: number - 1, count: units.len() };
         let in_folder = |path: &str, bytes: &[u8]| store(&format!("{}/{path}", unit_folder(number)), bytes);
         let report = tileset.write(&options, choice, &limits.surface, control, &part, in_folder)?;
@@ -146,7 +147,7 @@ pub fn write_stream(
     write: impl Fn(&str, &[u8]) -> io::Result<()> + Sync,
 ) -> Result<TilesetReport, WriteError> {
     let clock = StageClock::new(progress);
-    let tileset = Tileset::of_stream(stream, options, &limits.read, control, &clock)?;
+    let tileset = Tileset::of_stream(stream, options, &limits.read, &WorkScope::new(&clock, control))?;
     let store = |path: &str, bytes: &[u8]| store(&write, path, bytes);
     tileset.write(options, choice, &limits.surface, control, progress, store)
 }
@@ -205,7 +206,7 @@ impl<S: Deref<Target = Structure> + Sync> Tileset<S> {
             let control = &control.metered();
             let options = Options { tile: Some(address), ..options.clone() };
             let clock = StageClock::new(&());
-            let tile = self.product((&options, colors.as_ref()), choice, limits, &WorkScope::new(&clock, control))?;
+            let tile = self.product(&options, colors.as_ref(), choice, limits, &WorkScope::new(&clock, control))?;
             let n = done.fetch_add(1, Ordering::Relaxed) + 1;
             progress.progress("tiles", n as f64 / addresses.len() as f64);
             if tile.report.triangles == 0 {
