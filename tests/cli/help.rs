@@ -1,11 +1,11 @@
-//! Comparison of the help with files. After an intended change, run the test with `MOLMESH_BLESS=1` and read the
-//! difference.
+//! Comparison of the help, and of the summary in the documentation, with files. After an intended change, run the test
+//! with `MOLMESH_BLESS=1` and read the difference.
 
 use crate::cli_support;
 
 use std::path::Path;
 
-use cli_support::{assert_code, run, stdout};
+use cli_support::{Folder, assert_code, molmesh, run, stderr, stdout};
 
 fn snapshot(name: &str, args: &[&str]) {
     let done = run(args);
@@ -17,6 +17,30 @@ fn snapshot(name: &str, args: &[&str]) {
     }
     let kept = std::fs::read_to_string(&path).unwrap_or_default();
     assert_eq!(now, kept, "the help of {args:?} has changed");
+}
+
+#[test]
+fn the_summary_in_the_documentation_is_current() {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let (path, folder) = (root.join("docs/start/cli.md"), Folder::new());
+    std::os::unix::fs::symlink(root.join("samples"), folder.path("samples")).unwrap();
+    let done =
+        molmesh().args(["mesh", "samples/4pti.pdb", "-o", "4pti.glb"]).current_dir(folder.path("")).output().unwrap();
+    assert_code(&done, 0);
+    let summary = stderr(&done);
+    let page = std::fs::read_to_string(&path).unwrap();
+    let (start, rest) = page.split_once("```\n4PTI").expect("the page has the summary");
+    let (block, end) = rest.split_once("```").unwrap();
+    let documented = format!("4PTI{block}");
+    // The page has some of the lines.
+    let label = |line: &str| line.get(..12).unwrap_or_default().to_owned();
+    let labels: Vec<String> = documented.lines().map(label).collect();
+    let lines: Vec<&str> = summary.lines().filter(|line| labels.contains(&label(line))).collect();
+    if std::env::var_os("MOLMESH_BLESS").is_some() {
+        std::fs::write(&path, format!("{start}```\n{}\n```{end}", lines.join("\n"))).unwrap();
+    }
+    let documented: Vec<&str> = documented.lines().collect();
+    assert_eq!(lines, documented, "docs/start/cli.md has another summary; MOLMESH_BLESS=1 writes it");
 }
 
 #[test]

@@ -45,7 +45,7 @@ pub fn molmesh() -> Command {
 }
 
 /// Removes the environment variables that change the output of the binary, and its use of the network.
-pub fn prepared(mut command: Command) -> Command {
+fn prepared(mut command: Command) -> Command {
     for name in ["RUST_BACKTRACE", "RUST_LOG", "MOLMESH__DEVICES__USE", "COLUMNS", "CLICOLOR_FORCE"] {
         command.env_remove(name);
     }
@@ -218,7 +218,7 @@ impl Service {
     }
 
     /// Starts a service with the binary of `command`, as [`Self::start`] does.
-    pub fn start_as(mut command: Command, folder: &Folder, more: &[&str]) -> Self {
+    fn start_as(mut command: Command, folder: &Folder, more: &[&str]) -> Self {
         use std::io::{BufRead, BufReader};
         let mut child = command
             .args(["serve", "--listen", "127.0.0.1:0", "--metrics-listen", "127.0.0.1:0", "--data-dir"])
