@@ -9,7 +9,7 @@ SHELL := bash
 CARGO ?= cargo
 ARGS ?=
 
-.PHONY: help run install test interleavings fuzz chaos soak attack nightly nightly-data tools static static-if-possible web web-if-possible fmt fmt-check lint wasm deny audit sbom container tests python-test wheel bench figures gallery release clean
+.PHONY: help run install test interleavings fuzz chaos soak attack nightly nightly-data tools static web web-if-possible fmt fmt-check lint wasm deny audit sbom container tests python-test wheel bench figures gallery release clean
 
 help: ## List the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## (.*)/  make \1\t\2/' | expand -t 26
@@ -20,7 +20,7 @@ run: web-if-possible ## Build (the first time takes minutes) and serve on http:/
 install: web-if-possible ## Install the command molmesh, with the service and its web page, into ~/.cargo/bin
 	$(CARGO) install --path . --locked --profile fast-build
 
-STEPS := web fmt-check lint wasm tools deny static-if-possible interleavings python-test tests
+STEPS := web fmt-check lint wasm tools deny interleavings python-test tests
 
 # The steps add a line to the file SKIPPED for each check that they skip. The step `tests` prints this file; after the
 # failure of another step, it is printed here.
@@ -48,10 +48,11 @@ fmt: ## Format
 fmt-check:
 	$(CARGO) fmt --all -- --check
 
-# With the feature `gpu` only: `static-if-possible` compiles the program without it.
-lint: ## Clippy and documentation of everything; warnings are errors
-	$(CARGO) clippy --locked --workspace --all-targets -- -D warnings
-	RUSTDOCFLAGS="-D warnings" $(CARGO) doc --locked --workspace --no-deps --quiet
+# Shares the compiled dependencies of the tests. Only molmesh-bench needs the feature `gpu`.
+lint: ## Clippy on everything, and on the program without the feature `gpu`; warnings are errors
+	RUSTC_WORKSPACE_WRAPPER=$(CURDIR)/.ci/clippy $(CARGO) build --locked --workspace --all-targets
+	RUSTC_WORKSPACE_WRAPPER=$(CURDIR)/.ci/clippy $(CARGO) build --locked --workspace --exclude molmesh-bench \
+		--no-default-features --lib --bin molmesh
 
 WASM := wasm32-unknown-unknown
 wasm: ## Clippy on the core for WebAssembly; installs Rust's standard library for it with rustup
@@ -100,10 +101,13 @@ fuzz: ## Fuzz readers, configuration, keys, records and requests, 30 s per targe
 	RUSTC_WORKSPACE_WRAPPER=$(CURDIR)/fuzz/rustc.sh $(CARGO) build --locked --workspace --bin molmesh-fuzz --target-dir target
 	target/debug/molmesh-fuzz --seconds $(SECONDS)
 
-# BINARY=target/debug/molmesh uses the binary of the tests.
+# BINARY=target/debug/molmesh uses the binary of the tests. The batch has 2.5 files for each kill: with fewer, more files
+# use up their attempts.
 chaos: override KILLS := $(or $(KILLS),200)
-chaos: $(if $(BINARY),,release) ## Kill or stop the service at random points, KILLS=200 times, and check that no job is lost
+chaos: $(if $(BINARY),,release) ## Kill or stop the service at random points, KILLS=200 times, and kill it as often during one batch; check that no job is lost
 	python3 benches/load/chaos.py $(or $(BINARY),target/release/molmesh) samples/4pti.pdb --kills $(KILLS)
+	python3 benches/load/chaos.py $(or $(BINARY),target/release/molmesh) samples/4pti.pdb --kills $(KILLS) \
+		--batch $$((5 * $(KILLS) / 2))
 
 soak: override HOURS := $(or $(HOURS),1)
 soak: $(if $(BINARY),,release) ## Mixed load for HOURS=1, and check that memory does not grow and is freed at the end
@@ -135,14 +139,8 @@ figures: ## Update the tables of docs/research/paper.md and its figures from doc
 release: web-if-possible ## Build the optimized binary, target/release/molmesh
 	$(CARGO) build --release --locked --bin molmesh
 
-static: web-if-possible ## Build a static file for any Linux, without GPU support: dist/molmesh; installs what it needs
+static: web-if-possible ## Build and check a static file for any Linux, without GPU support: dist/molmesh; installs what it needs
 	deploy/static.sh
-
-# For the tests, with their profile, so that both share procedural macros and build scripts. Warnings are errors, as in
-# `lint`. Without Linux or network access, the tests of the static executable are skipped, or fail if CI is set. A
-# failed build is an error.
-static-if-possible:
-	@RUSTFLAGS="-D warnings" deploy/static.sh dev || { [ $$? -eq 3 ] && echo "without the static executable" >&2; }
 
 clean: ## Remove all build output
 	$(CARGO) clean

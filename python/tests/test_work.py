@@ -29,7 +29,7 @@ def test_other_threads_run_during_a_call():
     done = threading.Event()
 
     def work():
-        molmesh.surface(PDB, surface="ses", resolution=0.25)
+        molmesh.surface(PDB, surface="ses", resolution=0.15)
         done.set()
 
     thread = threading.Thread(target=work)
@@ -39,7 +39,8 @@ def test_other_threads_run_during_a_call():
         time.sleep(0.001)
         turns += 1
     thread.join()
-    assert turns > 50
+    # A call that holds the interpreter lock leaves a turn or two, before and after it.
+    assert turns > 10
 
 
 @pytest.mark.skipif(os.name != "posix", reason="sends a signal")
@@ -61,7 +62,7 @@ def test_ctrl_c_ends_a_call_soon():
 
 def test_progress_grows_to_one():
     seen = []
-    molmesh.surface(PDB, surface="ses", resolution=0.3, progress=lambda stage, part: seen.append((stage, part)))
+    molmesh.surface(PDB, surface="ses", resolution=0.15, progress=lambda stage, part: seen.append((stage, part)))
     stages, parts = zip(*seen)
     assert len(seen) > 2 and all(isinstance(stage, str) for stage in stages)
     assert list(parts) == sorted(parts) and parts[-1] == 1.0

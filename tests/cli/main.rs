@@ -32,6 +32,5 @@ mod mesh;
 mod readme;
 mod render;
 mod serve;
-mod static_build;
 mod stop;
 mod tileset;

@@ -109,7 +109,7 @@ fn run(
 #[test]
 fn every_caller_gets_a_mesh_although_a_device_fails() {
     let job = job();
-    shuttle::check_random(
+    molmesh_sync::explore(
         move || {
             let status = run(&job, 3, 2, SETTINGS, |_| {});
             assert_eq!(status.iter().map(|device| device.finished).sum::<u64>(), 3);
@@ -122,7 +122,7 @@ fn every_caller_gets_a_mesh_although_a_device_fails() {
 #[test]
 fn every_caller_gets_a_mesh_although_a_device_is_given_up() {
     let job = job();
-    shuttle::check_random(
+    molmesh_sync::explore(
         move || {
             let status = run(&job, 3, 0, SETTINGS, |pool| pool.give_up(0, "scripted"));
             assert!(status[0].down.is_some() && status[1].down.is_none() && status[0].waiting == 0);
@@ -134,7 +134,7 @@ fn every_caller_gets_a_mesh_although_a_device_is_given_up() {
 #[test]
 fn every_caller_gets_a_mesh_although_a_running_device_is_considered_hung() {
     let job = job();
-    shuttle::check_random(
+    molmesh_sync::explore(
         move || {
             let status = run(&job, 3, 0, SETTINGS, |pool| pool.check_devices(0..1, Duration::ZERO));
             assert!(status.iter().all(|device| device.waiting == 0) && status[1].down.is_none());
@@ -148,7 +148,7 @@ fn every_caller_gets_a_mesh_although_a_running_device_is_considered_hung() {
 fn a_device_that_hung_is_used_again() {
     let job = job();
     let settings = PoolSettings { cool_down: Duration::ZERO, ..SETTINGS };
-    shuttle::check_random(
+    molmesh_sync::explore(
         move || {
             for min_partition_bricks in [None, Some(1)] {
                 let settings = PoolSettings { min_partition_bricks, ..settings };
@@ -164,7 +164,7 @@ fn a_device_that_hung_is_used_again() {
 fn partitions_of_several_jobs_never_wait_for_each_other() {
     let job = job();
     let settings = PoolSettings { queue: 2, min_partition_bricks: Some(1), ..SETTINGS };
-    shuttle::check_random(
+    molmesh_sync::explore(
         move || {
             for failures in [0, 1] {
                 let status = run(&job, 2, failures, settings, |_| {});
@@ -178,7 +178,7 @@ fn partitions_of_several_jobs_never_wait_for_each_other() {
 #[test]
 fn a_cancelled_job_leaves_no_load() {
     let job = job();
-    shuttle::check_random(
+    molmesh_sync::explore(
         move || {
             let scheduler = Arc::new(Scheduler::new(&[(0, "device".to_owned())], SETTINGS));
             let thread = scheduler.begin_thread(0);

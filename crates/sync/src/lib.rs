@@ -68,3 +68,12 @@ pub async fn sleep(_: std::time::Duration) {
 pub async fn timeout<T>(_: std::time::Duration, work: impl Future<Output = T>) -> Result<T, std::convert::Infallible> {
     Ok(work.await)
 }
+
+/// Runs a model under `schedules` random schedules.
+#[cfg(feature = "shuttle")]
+pub fn explore(model: impl Fn() + Send + Sync + 'static, schedules: usize) {
+    let mut config = shuttle::Config::new();
+    // The stack of a thread, bytes. Nested futures of unoptimized code need more than the default.
+    config.stack_size = 1 << 20;
+    shuttle::Runner::new(shuttle::scheduler::RandomScheduler::new(schedules), config).run(model);
+}
