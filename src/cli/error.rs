@@ -8,7 +8,7 @@ use molmesh::structure::StructureError;
 use molmesh::surface::SurfaceError;
 use thiserror::Error;
 
-use super::style::Style;
+use super::style::{Style, printable};
 
 /// Exit codes. They are documented in `--help` and in `docs/start/cli.md` and do not change meaning.
 pub(crate) mod code {
@@ -198,7 +198,7 @@ impl CliError {
     /// Prints the error line and the hint line to stderr.
     pub(crate) fn print(&self, style: Style) {
         let hint = self.hint().map(|hint| format!("{} {hint}\n", style.dim("   hint:"))).unwrap_or_default();
-        let text = format!("{} {self}\n{hint}", style.red("molmesh:"));
+        let text = format!("{} {}\n{hint}", style.red("molmesh:"), printable(&self.to_string()));
         // A closed stderr is ignored; the exit code still reports the failure.
         drop(io::stderr().write_all(text.as_bytes()));
     }

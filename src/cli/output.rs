@@ -3,6 +3,7 @@
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, IsTerminal as _, Write};
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use molmesh::formats::{Format, RandomAccess};
@@ -14,6 +15,9 @@ use super::report::WrittenFile;
 
 /// Maximum size of one write, bytes. Cancellation is checked between writes.
 const MAX_WRITE: usize = 1 << 20;
+
+/// Number of files that this process has staged.
+static STAGED: AtomicU64 = AtomicU64::new(0);
 
 /// Open output. Dropping it without [`Output::finish`] removes the file.
 pub(crate) struct Output {
@@ -222,13 +226,14 @@ fn open_file(path: &Path) -> io::Result<To> {
         }
         None => {}
     }
-    let Some(file_name) = target.file_name() else { return Err(io::ErrorKind::InvalidInput.into()) };
-    let mut staged_name = std::ffi::OsString::from(".");
-    staged_name.push(file_name);
-    // The time makes the name unique if processes share an id, as in containers with a common volume.
+    if target.file_name().is_none() {
+        return Err(io::ErrorKind::InvalidInput.into());
+    }
+    // The time makes the name unique if processes share an id, as in containers with a common volume. The name of the
+    // target may be too long to be a part of it.
     let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_nanos();
-    staged_name.push(format!(".{}-{now:x}.part", std::process::id()));
-    let staged = target.with_file_name(staged_name);
+    let number = STAGED.fetch_add(1, Ordering::Relaxed);
+    let staged = target.with_file_name(format!(".molmesh-{}-{number}-{now:x}.part", std::process::id()));
     // Registered before the file exists, so that no interrupt can come in between.
     interrupt::stage(&staged);
     let created = OpenOptions::new().write(true).create_new(true).open(&staged).and_then(|file| {
@@ -245,7 +250,8 @@ mod tests {
     #[test]
     fn file_appears_only_when_it_is_finished() {
         let dir = tempfile::tempdir().unwrap();
-        let path = dir.path().join("a.glb");
+        // The longest name of common file systems.
+        let path = dir.path().join(format!("{}.glb", "a".repeat(251)));
         let entries = || fs::read_dir(dir.path()).unwrap().count();
         let cancel = CancelToken::default();
 

@@ -1,6 +1,6 @@
 //! Labelled lines on a terminal: layout of the summary, the banner and `doctor`.
 
-use super::style::Style;
+use super::style::{Style, printable};
 
 /// Width of the labels.
 const LABEL: usize = 10;
@@ -15,7 +15,10 @@ pub(crate) struct Page {
 impl Page {
     /// Creates a page with a title.
     pub(crate) fn new(style: Style, title: &str, rest: &str) -> Self {
-        Self { style, lines: vec![format!("{} {rest}", style.bold(title)).trim_end().to_owned()] }
+        Self {
+            style,
+            lines: vec![format!("{} {}", style.bold(&printable(title)), printable(rest)).trim_end().to_owned()],
+        }
     }
 
     /// Adds a labelled line.

@@ -9,6 +9,7 @@ use serde_json::{Value, json};
 use super::args::{ReportStyle, RunArgs};
 use super::error::CliError;
 use super::page::grouped;
+use super::style::printable;
 
 /// Written file.
 pub(crate) struct WrittenFile {
@@ -27,7 +28,7 @@ pub(crate) struct WrittenFile {
 impl WrittenFile {
     /// Returns the file as text.
     pub(super) fn text(&self) -> String {
-        format!("{} ({}, {} bytes)", self.name, self.format, grouped(self.bytes))
+        format!("{} ({}, {} bytes)", printable(&self.name), self.format, grouped(self.bytes))
     }
 }
 

@@ -18,7 +18,7 @@ use super::output::is_stdio;
 use super::page::Page;
 use super::report::CommandReport;
 use super::setup::{JobSetup, JobThreads};
-use super::style::Style;
+use super::style::{Style, printable};
 use super::{interrupt, request, summary};
 
 /// Runs the command.
@@ -170,6 +170,7 @@ fn text(report: &TilesetReport, findings: Option<&[Diagnostic]>, folder: &Path, 
     }
     let megabytes = report.bytes as f64 / 1e6;
     page.row("time", &format!("{seconds:.1} s"));
-    page.row("wrote", &format!("{} ({} files, {megabytes:.1} MB)", folder.display(), report.files));
+    let folder = folder.display().to_string();
+    page.row("wrote", &format!("{} ({} files, {megabytes:.1} MB)", printable(&folder), report.files));
     page.finish()
 }

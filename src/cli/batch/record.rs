@@ -15,7 +15,7 @@ use super::super::args::ReportStyle;
 use super::super::error::{CliError, meaning};
 use super::super::output::is_stdio;
 use super::super::page::grouped;
-use super::super::style::Style;
+use super::super::style::{Style, printable};
 use super::lines::SummaryLines;
 use super::table::JoinedTable;
 use super::{Batch, IN_WORK, ItemEnd, ItemResult};
@@ -212,7 +212,12 @@ impl<'a> Record<'a> {
                 let item = &items[index];
                 extensions.iter().map(move |extension| item.output(folder, extension))
             };
-            text.extend(self.written.iter().flat_map(files).map(|path| format!("wrote {}", path.display())));
+            text.extend(
+                self.written
+                    .iter()
+                    .flat_map(files)
+                    .map(|path| printable(&format!("wrote {}", path.display())).into_owned()),
+            );
         }
         let [all, written, skipped, failed] =
             [items.len(), self.written.len(), self.skipped, self.n_failed()].map(|n| grouped(n as u64));
