@@ -225,7 +225,7 @@ pub(super) fn save_later(app: &Shared, finished: &Arc<Finished>, format: Format,
     let span = TraceSpan::start(&SpanParent::current(), "save", SpanKind::Internal, Instant::now());
     let save = async move {
         let limit = shared.config.limits.output_bytes;
-        if let Err(error) = jobs::save(&shared.store, finished, format, &saved, limit).await {
+        if let Err(error) = jobs::save(&shared.store, finished, format, &saved, limit, true).await {
             counter!(RESULTS_NOT_STORED, "reason" => "failed").increment(1);
             tracing::warn!(%error, "cannot store a result");
         }

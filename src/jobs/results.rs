@@ -89,13 +89,15 @@ pub(crate) async fn is_stored(store: &Store, format: Format, key: &ContentKey) -
 }
 
 /// Stores the mesh as `format` and the report, unless both are stored already. The report comes last, because it
-/// contains the digest of the mesh. They are not removed before the returned pin is dropped.
+/// contains the digest of the mesh. They are not removed before the returned pin is dropped. Unless `is_cached`, the
+/// mesh is not kept in memory.
 pub(crate) async fn save(
     store: &Store,
     finished: Arc<Finished>,
     format: Format,
     key: &ContentKey,
     limit: u64,
+    is_cached: bool,
 ) -> Result<Pin, SaveError> {
     let (mesh, report) = (key.name(format.name())?, key.name(REPORT)?);
     // Writing the report must not evict its mesh.
@@ -114,7 +116,7 @@ pub(crate) async fn save(
             return Err(SaveError::Format(error.error()));
         }
         let write = || {
-            let mut writer = writing.writer(&name);
+            let mut writer = writing.writer(&name).cached(is_cached);
             file.write(&mut writer).map_err(from_io)?;
             let (mesh_bytes, mesh_sha256) = writer.finish()?;
             report_file(document.clone(), mesh_bytes, mesh_sha256)

@@ -249,9 +249,11 @@ async fn save(
     let span = TraceSpan::start(&parent, "save", SpanKind::Internal, Instant::now());
     let failed = |error| EndError::Save { error, resolution };
     let pin = jobs.0.store.pin(&key.name(format.name()).map_err(|error| failed(error.into()))?);
+    // The results of a batch are read once, in its archive, and would replace all others.
+    let is_cached = record.batch.is_none();
     let start = || {
         let (store, finished, limit) = (jobs.0.store.clone(), Arc::clone(&finished), jobs.0.output_bytes);
-        async move { results::save(&store, finished, format, &key, limit).await.map(drop) }
+        async move { results::save(&store, finished, format, &key, limit, is_cached).await.map(drop) }
     };
     let save = async || {
         let saved = jobs.0.saves.run(&key, start).recv().await;

@@ -108,9 +108,12 @@ async fn a_full_disk_evicts_twice_the_size_and_tries_once_more() {
 async fn cached_results_keep_no_buffer_of_their_writer() {
     let dir = tempfile::tempdir().unwrap();
     let store = Store::open(&StoreConfig::default(), dir.path()).await.unwrap();
-    let mut writer = store.writer(&name(1));
-    let write = move || io::Write::write_all(&mut writer, &body(1000)).map(|()| writer.finish());
-    tokio::task::spawn_blocking(write).await.unwrap().unwrap().unwrap();
+    for (number, is_cached) in [(1, true), (3, false)] {
+        let mut writer = store.writer(&name(number)).cached(is_cached);
+        let write = move || io::Write::write_all(&mut writer, &body(1000)).map(|()| writer.finish());
+        tokio::task::spawn_blocking(write).await.unwrap().unwrap().unwrap();
+    }
+    assert!(store.0.memory.get(&name(3)).is_none());
     let mut part = vec![7; 1 << 20];
     part.truncate(1000);
     store.put(&name(2), part.into()).await.unwrap();

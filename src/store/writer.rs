@@ -22,6 +22,8 @@ pub struct Writer {
     reservation: SpaceReservation,
     filling: BytesMut,
     hasher: Hasher,
+    /// True if a small object is cached in memory.
+    is_cached: bool,
     /// Upload in parts, from the first full part on.
     upload: Option<ObjectUpload>,
     /// Total size of the uploaded parts, bytes.
@@ -41,6 +43,7 @@ impl Store {
             reservation: self.empty_reservation(name),
             filling: BytesMut::new(),
             hasher: Hasher::default(),
+            is_cached: true,
             upload: None,
             uploaded: 0,
             failed: false,
@@ -49,6 +52,13 @@ impl Store {
 }
 
 impl Writer {
+    /// Leaves the object out of the cache in memory unless `is_cached`.
+    #[must_use]
+    pub(crate) fn cached(mut self, is_cached: bool) -> Self {
+        self.is_cached = is_cached;
+        self
+    }
+
     /// Makes the object visible. It is durable on return. Returns its size, bytes, and its digest.
     ///
     /// # Errors
@@ -78,7 +88,7 @@ impl Writer {
         // An object of one part needs no multipart upload, and may be cached.
         let size = last.len() as u64;
         self.store.0.backend.put(&self.name, last.clone(), false).await?;
-        self.store.commit(&self.name, size, Some(&last), &mut self.reservation);
+        self.store.commit(&self.name, size, self.is_cached.then_some(&last), &mut self.reservation);
         Ok(size)
     }
 
