@@ -4,7 +4,6 @@
 //! or exceeds a limit, is refused as a whole.
 
 use std::cell::Cell;
-use std::collections::HashMap;
 use std::fs::File;
 use std::io::{self, Read, Seek as _, SeekFrom};
 
@@ -13,6 +12,7 @@ use flate2::read::{DeflateDecoder, MultiGzDecoder};
 use rawzip::{CompressionMethod, RECOMMENDED_BUFFER_SIZE, ZipArchive};
 use tar::{Archive, Entry, EntryType, PaxExtensions};
 
+use super::batch_names::{MAX_NAME_BYTES, Outputs, check_name};
 use super::problem::Problem;
 use super::problem_types::ProblemType;
 use crate::jobs::Budget;
@@ -22,8 +22,6 @@ use crate::surface::{Control, Exceeded, Limit, OutOfMemory};
 /// Maximum number of entries. Fixed: four times the default number of jobs of one client; each takes a line of the
 /// batch's record.
 pub(super) const MAX_ENTRIES: usize = 10_000;
-/// Maximum length of an entry's name, bytes: the usual limit of a file name.
-const MAX_NAME_BYTES: usize = 255;
 /// Maximum size of the extended header of a tar entry, bytes. Names take a few hundred.
 const MAX_HEADER_BYTES: u64 = 64 << 10;
 /// Maximum length of the reason for which an archive cannot be read, characters.
@@ -53,15 +51,18 @@ pub(super) struct ArchiveEntry {
 }
 
 /// Reads the entries of an archive, charges each to `budget`, and passes it to `visit`. Folders have no entry.
+/// `extensions` are those of the results of an entry.
 pub(super) fn read(
     mut file: &File,
     limits: ArchiveLimits,
+    extensions: &[&'static str],
     budget: &Budget,
     control: &Control<'_>,
     visit: impl FnMut(ArchiveEntry) -> Result<(), Problem>,
 ) -> Result<(), Problem> {
     let left = Cell::new(limits.total.saturating_add(1));
-    let reader = ArchiveReader { limits, budget, control, left: &left, entries: 0, outputs: HashMap::new(), visit };
+    let outputs = Outputs::new(extensions);
+    let reader = ArchiveReader { limits, budget, control, left: &left, entries: 0, outputs, visit };
     let mut start = [0; 4];
     let n = file.seek(SeekFrom::Start(0)).and_then(|_| file.read(&mut start)).map_err(Problem::internal)?;
     file.seek(SeekFrom::Start(0)).map_err(Problem::internal)?;
@@ -72,19 +73,6 @@ pub(super) fn read(
     } else {
         reader.read_tar(file)
     }
-}
-
-/// Returns the name of an entry's outputs, without their extension: the entry's own without that of a compression and
-/// that of its format.
-pub(super) fn stem(name: &str) -> &str {
-    let file = name.rfind('/').map_or(0, |slash| slash + 1);
-    let without = |name: &str, known: &dyn Fn(&str) -> bool| {
-        let dot = name[file..].rfind('.').filter(|dot| *dot > 0 && known(&name[file + dot + 1..]));
-        dot.map_or(name.len(), |dot| file + dot)
-    };
-    let inflated =
-        &name[..without(name, &|end| ["gz", "zst", "zstd"].iter().any(|known| end.eq_ignore_ascii_case(known)))];
-    &inflated[..without(inflated, &|_| true)]
 }
 
 fn refused(detail: impl Into<String>) -> Problem {
@@ -115,9 +103,7 @@ struct ArchiveReader<'a, V> {
     /// Bytes that may still be decompressed; 0 once the limit is exceeded.
     left: &'a Cell<u64>,
     entries: usize,
-    /// Names of the entries so far, by the names of their outputs in lower case, which some file systems do not
-    /// distinguish.
-    outputs: HashMap<String, String>,
+    outputs: Outputs<'a>,
     visit: V,
 }
 
@@ -126,12 +112,21 @@ struct Counted<'a, R> {
     inner: R,
     left: &'a Cell<u64>,
     control: &'a Control<'a>,
+    /// True once the end was reached.
+    has_ended: bool,
+}
+
+impl<'a, R> Counted<'a, R> {
+    fn new(inner: R, left: &'a Cell<u64>, control: &'a Control<'a>) -> Self {
+        Self { inner, left, control, has_ended: false }
+    }
 }
 
 impl<R: Read> Read for Counted<'_, R> {
     fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
         self.control.check().map_err(io::Error::other)?;
         let n = self.inner.read(buffer)?;
+        self.has_ended |= n == 0 && !buffer.is_empty();
         let left = self.left.get().saturating_sub(n as u64);
         self.left.set(left);
         if n > 0 && left == 0 { Err(io::Error::other("the limit is exceeded")) } else { Ok(n) }
@@ -173,7 +168,7 @@ impl<V: FnMut(ArchiveEntry) -> Result<(), Problem>> ArchiveReader<'_, V> {
                 (shown.into_owned(), Err(refused(format!("the name of the entry {why}"))))
             }
         };
-        let content = match valid.and_then(|()| self.add_output(&name)) {
+        let content = match valid.and_then(|()| self.outputs.add(&name).map_err(refused)) {
             Err(problem) => Err(problem),
             Ok(()) => match content(self) {
                 Ok(bytes) => Ok(bytes),
@@ -183,21 +178,6 @@ impl<V: FnMut(ArchiveEntry) -> Result<(), Problem>> ArchiveReader<'_, V> {
             },
         };
         (self.visit)(ArchiveEntry { name, content })
-    }
-
-    /// Refuses an entry whose outputs would have the names of those of an earlier one.
-    fn add_output(&mut self, name: &str) -> Result<(), Problem> {
-        let stem = stem(name);
-        if let Some(first) = self.outputs.get(&stem.to_lowercase()) {
-            let detail = if first == name {
-                "the archive has an earlier entry of this name".to_owned()
-            } else {
-                format!("the results of `{first}` and of this entry would have one name, `{stem}`")
-            };
-            return Err(refused(detail));
-        }
-        self.outputs.insert(stem.to_lowercase(), name.to_owned());
-        Ok(())
     }
 
     /// Reads an entry of `size` bytes, as its header says.
@@ -233,7 +213,7 @@ impl<V: FnMut(ArchiveEntry) -> Result<(), Problem>> ArchiveReader<'_, V> {
 
     /// Reads the headers of a tar archive one by one, since the library reads extended headers of any size.
     fn read_tar(mut self, reader: impl Read) -> Result<(), Problem> {
-        let mut archive = Archive::new(Counted { inner: reader, left: self.left, control: self.control });
+        let mut archive = Archive::new(Counted::new(reader, self.left, self.control));
         let mut extended = None;
         for entry in archive.entries().map_err(unreadable)?.raw(true) {
             let mut entry = entry.map_err(|error| self.failed(error))?;
@@ -259,8 +239,13 @@ impl<V: FnMut(ArchiveEntry) -> Result<(), Problem>> ArchiveReader<'_, V> {
                 this.content(&mut entry, size)
             })?;
         }
-        // The rest has the checksum of gzip, which is compared at the end. Further archives would be lost silently.
         let (mut rest, mut piece) = (archive.into_inner(), vec![0; PIECE]);
+        // An archive that was cut between two entries looks complete otherwise. Writers end it with two empty blocks
+        // and often pad it; a single one, which some writers leave, shows as well that nothing is missing.
+        if rest.has_ended {
+            return Err(unreadable("it ends without an empty block; it is not complete"));
+        }
+        // The rest has the checksum of gzip, which is compared at the end. Further archives would be lost silently.
         loop {
             match rest.read(&mut piece).map_err(|error| self.failed(error))? {
                 0 => return Ok(()),
@@ -292,7 +277,7 @@ impl<V: FnMut(ArchiveEntry) -> Result<(), Problem>> ArchiveReader<'_, V> {
                 }
                 let broken = |error: &dyn std::fmt::Display| refuse(format!("the entry cannot be read: {error}"));
                 let found = archive.get_entry(entry.wayfinder()).map_err(|error| broken(&error))?;
-                let counted = |inner| Counted { inner, left: this.left, control: this.control };
+                let counted = |inner| Counted::new(inner, this.left, this.control);
                 let size = entry.uncompressed_size_hint();
                 let content = match method {
                     CompressionMethod::STORE => {
@@ -342,49 +327,52 @@ fn extended_name(header: &mut Entry<'_, impl Read>, kind: EntryType) -> io::Resu
     Ok(name)
 }
 
-/// Returns a name that is safe as a relative path, without `./` at its start, or the reason for which it is refused.
-fn check_name(name: &[u8]) -> Result<&str, &'static str> {
-    if name.len() > MAX_NAME_BYTES {
-        return Err("has more than 255 bytes");
-    }
-    let name = str::from_utf8(name).map_err(|_bad| "is not UTF-8")?;
-    let name = name.trim_start_matches("./");
-    if name.starts_with('/') || name.chars().any(|c| c.is_control() || matches!(c, '\\' | ':')) {
-        return Err("is absolute or has a control character, a backslash or a colon");
-    }
-    if name.split('/').any(|part| matches!(part, "" | "." | "..")) {
-        return Err("has an empty part, `.` or `..`");
-    }
-    Ok(name)
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    #[test]
-    fn names_are_relative_paths() {
-        assert_eq!(
-            ["a.pdb", "./a/b.cif", "ä b"].map(|name| check_name(name.as_bytes())),
-            [Ok("a.pdb"), Ok("a/b.cif"), Ok("ä b")]
-        );
-        for bad in ["", "/a", "../a", "a/../b", "a//b", "a/", "c:a", "a\\b", "a\nb", "a\0", ".", &"a".repeat(256)] {
-            assert!(check_name(bad.as_bytes()).is_err(), "{bad}");
-        }
-        assert!(check_name(b"\xff").is_err());
+    /// Returns the names of the entries of an archive, or the reason for which it is refused.
+    fn names_in(bytes: &[u8]) -> Result<Vec<String>, String> {
+        let mut file = tempfile::tempfile().unwrap();
+        std::io::Write::write_all(&mut file, bytes).unwrap();
+        let limits = ArchiveLimits { entry: 1 << 20, total: 1 << 20 };
+        let (budget, mut names) = (Budget::new(1 << 20), Vec::new());
+        let visit = |entry: ArchiveEntry| {
+            names.push(entry.name);
+            Ok(())
+        };
+        let read = read(&file, limits, &["glb"], &budget, &Control::default(), visit);
+        read.map(|()| names).map_err(Problem::into_detail)
     }
 
     #[test]
-    fn outputs_have_the_stem_of_their_entry() {
-        for (name, expected) in [
-            ("1crn.cif", "1crn"),
-            ("a.b/1crn.cif.gz", "a.b/1crn"),
-            ("1crn.PDB.ZST", "1crn"),
-            ("AF-P1-F1-model_v4.1.cif", "AF-P1-F1-model_v4.1"),
-            ("plain", "plain"),
-            ("a.b/.hidden", "a.b/.hidden"),
-        ] {
-            assert_eq!(stem(name), expected, "{name}");
+    fn a_tar_archive_ends_with_an_empty_block() {
+        let mut builder = tar::Builder::new(Vec::new());
+        for name in ["a.pdb", "b.pdb"] {
+            let mut header = tar::Header::new_gnu();
+            header.set_size(700);
+            builder.append_data(&mut header, name, &[b'x'; 700][..]).unwrap();
         }
+        let whole = builder.into_inner().unwrap();
+        let (entry, block) = (512 + 1024, 512);
+        assert_eq!(whole.len(), 2 * entry + 2 * block);
+        let gzip = |bytes: &[u8]| {
+            let mut encoder = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::fast());
+            std::io::Write::write_all(&mut encoder, bytes).unwrap();
+            encoder.finish().unwrap()
+        };
+        let padded = [&whole[..], &[0; 10_240]].concat();
+        for complete in [&whole[..], &whole[..2 * entry + block], &whole[..2 * entry + block + 100], &padded] {
+            for bytes in [complete.to_vec(), gzip(complete)] {
+                assert_eq!(names_in(&bytes).unwrap(), ["a.pdb", "b.pdb"]);
+            }
+        }
+        for cut in [entry, 2 * entry, 2 * entry - 10, 2 * entry + 100, entry + 100] {
+            for bytes in [whole[..cut].to_vec(), gzip(&whole[..cut])] {
+                let error = names_in(&bytes).unwrap_err();
+                assert!(error.starts_with("the archive cannot be read: "), "{cut}: {error}");
+            }
+        }
+        assert!(names_in(&whole[..entry]).unwrap_err().contains("without an empty block"));
     }
 }

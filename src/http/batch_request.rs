@@ -120,6 +120,7 @@ impl NewBatch {
         let files = match &self.source {
             BatchSource::Archive(file) => {
                 let (file, limits, budget) = (Arc::clone(file), self.limits(), self.budget());
+                let extensions = self.plan.extensions();
                 let read = self.app.read(&self.caller, (), move |control| {
                     let mut files = Vec::new();
                     let visit = |ArchiveEntry { name, content }: ArchiveEntry| {
@@ -130,7 +131,7 @@ impl NewBatch {
                         files.push(CheckedFile { name, input });
                         Ok(())
                     };
-                    batch_archive::read(&file.file, limits, &budget, control, visit).map(|()| files)
+                    batch_archive::read(&file.file, limits, &extensions, &budget, control, visit).map(|()| files)
                 });
                 read.await??
             }
@@ -289,7 +290,8 @@ impl NewBatch {
             BatchSource::Archive(file) => {
                 let (sender, receiver) = mpsc::channel(1);
                 let (file, limits, budget) = (Arc::clone(file), self.limits(), self.budget());
-                tokio::task::spawn_blocking(move || send_files(&file, limits, &budget, &inputs, &sender));
+                let extensions = self.plan.extensions();
+                tokio::task::spawn_blocking(move || send_files(&file, limits, &extensions, &budget, &inputs, &sender));
                 stream::unfold(receiver, |mut receiver| async { Some((receiver.recv().await?, receiver)) }).boxed()
             }
             BatchSource::PdbIds(_) => {
@@ -309,6 +311,7 @@ impl NewBatch {
 fn send_files(
     file: &ScratchFile,
     limits: ArchiveLimits,
+    extensions: &[&'static str],
     budget: &Budget,
     inputs: &[Option<Digest>],
     sender: &mpsc::Sender<(usize, Result<Loaded, Problem>)>,
@@ -324,7 +327,7 @@ fn send_files(
         index += 1;
         sent
     };
-    if let Err(problem) = batch_archive::read(&file.file, limits, budget, &Control::default(), visit) {
+    if let Err(problem) = batch_archive::read(&file.file, limits, extensions, budget, &Control::default(), visit) {
         // The files that were not read are missing otherwise.
         drop(sender.blocking_send((index.min(inputs.len().saturating_sub(1)), Err(problem))));
     }

@@ -16,7 +16,7 @@ use serde_json::Value;
 use tokio::sync::mpsc;
 use tracing::Instrument as _;
 
-use super::batch_archive::stem;
+use super::batch_names::{SUMMARY, stem};
 use super::batch_plan::AREAS_EXTENSION;
 use super::batch_state::{find, plan};
 use super::content_type::DeclaredType;
@@ -38,8 +38,6 @@ use crate::store::{Digest, StoreError};
 const PIECES: usize = 4;
 /// Size of the blocks of a tar archive, bytes.
 const BLOCK: usize = 512;
-/// Name of the summary. No result has its extension.
-const SUMMARY: &str = "summary.jsonl";
 /// Number of attempts to compute areas while the service is busy, and the pause between two.
 const ATTEMPTS: usize = 60;
 const PAUSE: Duration = Duration::from_secs(1);

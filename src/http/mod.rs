@@ -75,6 +75,8 @@ mod structures;
 mod tilesets;
 
 // Batches.
+mod batch_names;
+
 mod batch_archive;
 mod batch_state;
 

@@ -195,7 +195,8 @@ fn archives_of_every_kind_and_lists_of_ids_are_accepted() {
     let (backend, server) = fake(Mode::Octahedra, |c| c.store.memory_bytes = 0);
     let files: [(&str, &[u8]); 2] = [("a.pdb", SAMPLE), ("b.pdb", &sample(1))];
     for body in [tar(&files), gzip(&tar(&files)), zip(&files)] {
-        let results = Results::get(&server, &accepted(&server, "", &[], &body));
+        // Defaults are accepted for outputs without the parameter.
+        let results = Results::get(&server, &accepted(&server, "?by=residue&width=512", &[], &body));
         assert_eq!(results.names, ["a.glb", "b.glb", "summary.jsonl"]);
     }
     assert_eq!(backend.started.load(Ordering::SeqCst), 2, "stored results are used again");
@@ -242,6 +243,7 @@ fn entries_that_cannot_be_used_are_refused_by_name() {
         ("folder/", b'5', b""),
         ("./good.pdb", b'0', SAMPLE),
         ("good.cif", b'0', b"x"),
+        ("Good.GLB/in.pdb", b'0', SAMPLE),
         ("nested.tar", b'0', &nested),
         ("empty.pdb", b'0', b""),
         ("large.pdb", b'0', &vec![b' '; 100_001]),
@@ -257,11 +259,14 @@ fn entries_that_cannot_be_used_are_refused_by_name() {
         ("hard.pdb", "bad-request"),
         ("device.pdb", "bad-request"),
         ("good.cif", "bad-request"),
+        ("Good.GLB/in.pdb", "bad-request"),
         ("nested.tar", "unreadable-structure"),
         ("empty.pdb", "unreadable-structure"),
         ("large.pdb", "body-too-large"),
     ];
     assert_eq!(found, expected, "{:?}", results.failed());
+    let detail = "`good.glb` would be a result of `good.pdb` and a folder of the results of this entry";
+    assert!(results.failed().contains(&("Good.GLB/in.pdb", "bad-request", detail)), "{:?}", results.failed());
     // An encrypted and a damaged entry of a zip archive.
     let mut body =
         zip(&[("secret.pdb", SAMPLE), ("damaged.pdb", &sample(1)), ("good.pdb", &sample(2)), ("xx/x", b"x")]);
@@ -307,10 +312,16 @@ fn archives_beyond_a_limit_are_refused_as_a_whole() {
         post(bad).problem(400, "bad-request");
     }
     post(&[&whole[..512], &[b'x'; 512]].concat()).problem(400, "bad-request");
+    // Cut between two entries.
+    let cut = &samples(2)[..512 * (1 + sample(0).len().div_ceil(512))];
+    for bad in [cut, &gzip(cut)] {
+        let detail = post(bad).problem(400, "bad-request")["detail"].clone();
+        assert_eq!(detail, "the archive cannot be read: it ends without an empty block; it is not complete");
+    }
     let form = [("content-type", "multipart/form-data; boundary=X")];
     server.post(BATCHES, &form, &whole).problem(415, "unsupported-media-type");
     server.post(BATCHES, &[("content-encoding", "br")], &whole).problem(415, "unsupported-encoding");
-    for query in ["?outputs=exe", "?outputs=areas", "?format=glb", "?resolutoin=1", "?color=map"] {
+    for query in ["?outputs=exe", "?outputs=areas", "?format=glb", "?resolutoin=1", "?color=map", "?by=chain"] {
         server.post(&format!("{BATCHES}{query}"), &[], &whole).problem(400, "bad-parameter");
     }
     assert_eq!(std::fs::read_dir(server.dir.path().join("store/jobs")).unwrap().count(), 0, "nothing was accepted");

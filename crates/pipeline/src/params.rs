@@ -372,7 +372,7 @@ fn set_format(options: &mut Options, format: Format) -> Result<(), ParamError> {
 }
 
 /// Returns the error for a name that is not among `known`.
-fn unknown(name: &str, known: impl IntoIterator<Item = &'static str>) -> ParamError {
+pub fn unknown(name: &str, known: impl IntoIterator<Item = &'static str>) -> ParamError {
     ParamError::Unknown { name: name.chars().take(64).collect(), nearest: nearest(name, known) }
 }
 
