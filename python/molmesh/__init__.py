@@ -26,7 +26,7 @@ from ._molmesh import (
     surface,
 )
 
-_CLIENTS = ["AsyncClient", "AsyncJob", "Client", "Job", "MapResult"]
+_CLIENTS = ["AsyncBatch", "AsyncClient", "AsyncJob", "Batch", "Client", "Job", "MapResult"]
 
 __all__ = [
     "PARAMETERS",

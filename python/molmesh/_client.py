@@ -1,18 +1,25 @@
-"""Clients of a service. They send the requests of the operations in ``_session`` and wait."""
+"""Clients of a service. They send the requests of the operations in ``_session`` and wait.
+
+Coroutines of `StepClient` perform the operations for both clients. Those of ``Client`` block instead of waiting for an
+event loop.
+"""
 
 import asyncio
 import concurrent.futures
+import contextlib
 import itertools
 import threading
 import time
+from typing import Any, NamedTuple
 
 import httpx
 
-from ._messages import MapResult, Pause, Response
-from ._methods import ClientMethods, JobMethods
+from ._job_methods import BatchMethods, JobMethods
+from ._messages import Item, MapResult, Output, Pause, Read, Response
+from ._methods import ClientMethods
 from ._molmesh import __version__
 
-__all__ = ["AsyncClient", "AsyncJob", "Client", "Job", "MapResult"]
+__all__ = ["AsyncBatch", "AsyncClient", "AsyncJob", "Batch", "Client", "Job", "MapResult"]
 
 # Longest time to connect, s.
 CONNECT_TIMEOUT = 10.0
@@ -27,23 +34,88 @@ def client_options(session):
     }
 
 
-def stream_arguments(request):
-    """Returns the arguments of ``httpx.Client.stream()``."""
+def request_arguments(request):
+    """Returns the arguments of ``httpx.Client.build_request()``."""
     timeout = httpx.Timeout(request.timeout, connect=min(request.timeout, CONNECT_TIMEOUT))
     query = {"params": request.query} if request.query else {}
     names = {"method": request.method, "url": request.path, "headers": request.headers, "timeout": timeout}
     return {**names, **query, **request.body}
 
 
-def is_kept_in_memory(request, response):
-    """Returns true if the content is returned instead of written to the output file."""
-    return request.output is None or request.output.path is None or response.status_code != 200
-
-
 def transport_error(session, error):
     """Returns the exception of a request without a response."""
     kind = TimeoutError if isinstance(error, httpx.TimeoutException) else ConnectionError
     return kind(f"no response from {session.url}: {error or type(error).__name__}")
+
+
+def complete(coroutine):
+    """Runs a coroutine that does not wait for an event loop. Returns its result."""
+    try:
+        coroutine.send(None)
+    except StopIteration as end:
+        return end.value
+    raise RuntimeError("the operation waits for an event loop")
+
+
+class Stream(NamedTuple):
+    """Response whose content is being received."""
+
+    response: Any
+    # Iterator over the content, blocking or asynchronous like the client.
+    pieces: Any
+
+
+class StepClient(ClientMethods):
+    """Client that performs operations with ``_pause``, ``_open``, ``_read`` and ``_close`` of a subclass."""
+
+    async def _perform(self, steps, stop=None, streams=None):
+        """Performs an operation to its next `Item`, which it returns, or to its end. Ends it without a result if the
+        event `stop` is set. The stack `streams` gets the responses that `Read` steps read, and closes them.
+        """
+        try:
+            step = next(steps)
+            while stop is None or not stop.is_set():
+                if isinstance(step, Item):
+                    return step
+                try:
+                    answer = await self._answer(step, stop, streams)
+                except Exception as error:
+                    step = steps.throw(error)
+                else:
+                    step = steps.send(answer)
+        except StopIteration as end:
+            return end.value
+
+    async def _items(self, steps):
+        """Performs an operation and yields its items."""
+        async with contextlib.AsyncExitStack() as streams:
+            streams.enter_context(contextlib.closing(steps))
+            while item := await self._perform(steps, streams=streams):
+                yield item.value
+
+    async def _answer(self, step, stop, streams):
+        if isinstance(step, Pause):
+            return await self._pause(step.seconds, stop)
+        try:
+            return await (self._read(step.stream) if isinstance(step, Read) else self._send(step, streams))
+        except httpx.HTTPError as error:
+            raise transport_error(self._session, error) from error
+
+    async def _send(self, request, streams):
+        """Sends a request."""
+        stream = await self._open(request_arguments(request))
+        status, headers = stream.response.status_code, stream.response.headers
+        if request.is_stream and status == 200:
+            streams.push_async_callback(self._close, stream)
+            return Response(status, headers, stream)
+        try:
+            output = request.output if request.output is not None and status == 200 else Output()
+            file = output.restart()
+            while piece := await self._read(stream):
+                file.write(piece)
+            return Response(status, headers, file.getvalue() if output.path is None else b"")
+        finally:
+            await self._close(stream)
 
 
 class Job(JobMethods):
@@ -64,7 +136,28 @@ class AsyncJob(JobMethods):
     """Asynchronous job of a service, from ``AsyncClient.submit()``. Its methods are those of ``Job`` as coroutines."""
 
 
-class Client(ClientMethods):
+class Batch(BatchMethods):
+    """Batch of a service, from ``Client.submit_batch()``: one set of parameters for many files.
+
+    Examples
+    --------
+    >>> client = molmesh.Client("http://127.0.0.1:8080")
+    >>> batch = client.submit_batch(["samples/4pti.pdb", "samples/1crn.cif"], outputs=["stl"], resolution=1)
+    >>> for name, content in batch.results():
+    ...     print(name)
+    4pti.stl
+    1crn.stl
+    summary.jsonl
+    """
+
+
+class AsyncBatch(BatchMethods):
+    """Batch of a service, from ``AsyncClient.submit_batch()``. Its methods are those of ``Batch`` as coroutines;
+    ``results()`` and ``files()`` return asynchronous iterators.
+    """
+
+
+class Client(StepClient):
     """Client of a service of molmesh. Threads may share it.
 
     Requests that the service rejects temporarily (424, 429, 502, 503) are retried after the time that it names, and
@@ -88,7 +181,7 @@ class Client(ClientMethods):
     True
     """
 
-    _job_type = Job
+    _job_type, _batch_type = Job, Batch
 
     def _connect(self):
         """Creates the HTTP client."""
@@ -106,37 +199,37 @@ class Client(ClientMethods):
 
     def _run(self, steps, stop=None):
         """Performs an operation. Ends it without a result if the event `stop` is set."""
-        try:
-            step = next(steps)
-            while stop is None or not stop.is_set():
-                try:
-                    if isinstance(step, Pause):
-                        answer = time.sleep(step.seconds) if stop is None else stop.wait(step.seconds)
-                    else:
-                        answer = self._send(step)
-                except Exception as error:
-                    step = steps.throw(error)
-                else:
-                    step = steps.send(answer)
-        except StopIteration as end:
-            return end.value
-        finally:
-            steps.close()
+        with contextlib.closing(steps):
+            return complete(self._perform(steps, stop))
 
-    def _send(self, request):
-        """Sends a request."""
+    async def _pause(self, seconds, stop):
+        if stop is None:
+            time.sleep(seconds)
+        else:
+            stop.wait(seconds)
+
+    async def _open(self, arguments):
+        response = self._http.send(self._http.build_request(**arguments), stream=True)
+        return Stream(response, response.iter_bytes())
+
+    async def _read(self, stream):
+        return next(stream.pieces, b"")
+
+    async def _close(self, stream):
+        stream.response.close()
+
+    def _iterate(self, steps):
+        """Performs an operation and yields its items."""
+        items = self._items(steps)
         try:
-            with self._http.stream(**stream_arguments(request)) as response:
-                content = b""
-                if is_kept_in_memory(request, response):
-                    content = response.read()
-                else:
-                    file = request.output.restart()
-                    for piece in response.iter_bytes():
-                        file.write(piece)
-                return Response(response.status_code, response.headers, content)
-        except httpx.HTTPError as error:
-            raise transport_error(self._session, error) from error
+            while (item := complete(anext(items, None))) is not None:
+                yield item
+        finally:
+            complete(items.aclose())
+
+    def _collect(self, steps):
+        """Performs an operation and returns its items."""
+        return list(self._iterate(steps))
 
     def _each(self, operations, concurrency):
         """Yields the results of operations as they complete."""
@@ -175,10 +268,11 @@ class Client(ClientMethods):
         return future
 
 
-class AsyncClient(ClientMethods):
+class AsyncClient(StepClient):
     """Client of a service of molmesh for asyncio. Its methods are those of ``Client`` as coroutines.
 
-    ``map()`` returns an asynchronous iterator, and ``job()`` the job. Files are read and written without a thread.
+    ``map()`` and ``jobs()`` return asynchronous iterators, ``job()`` the job and ``batch()`` the batch. Files are read
+    and written without a thread.
 
     Parameters
     ----------
@@ -195,7 +289,7 @@ class AsyncClient(ClientMethods):
     True
     """
 
-    _job_type = AsyncJob
+    _job_type, _batch_type = AsyncJob, AsyncBatch
 
     def _connect(self):
         """Creates the HTTP client."""
@@ -213,37 +307,30 @@ class AsyncClient(ClientMethods):
 
     async def _run(self, steps):
         """Performs an operation."""
-        try:
-            step = next(steps)
-            while True:
-                try:
-                    if isinstance(step, Pause):
-                        answer = await asyncio.sleep(step.seconds)
-                    else:
-                        answer = await self._send(step)
-                except Exception as error:
-                    step = steps.throw(error)
-                else:
-                    step = steps.send(answer)
-        except StopIteration as end:
-            return end.value
-        finally:
-            steps.close()
+        with contextlib.closing(steps):
+            return await self._perform(steps)
 
-    async def _send(self, request):
-        """Sends a request."""
-        try:
-            async with self._http.stream(**stream_arguments(request)) as response:
-                content = b""
-                if is_kept_in_memory(request, response):
-                    content = await response.aread()
-                else:
-                    file = request.output.restart()
-                    async for piece in response.aiter_bytes():
-                        file.write(piece)
-                return Response(response.status_code, response.headers, content)
-        except httpx.HTTPError as error:
-            raise transport_error(self._session, error) from error
+    async def _pause(self, seconds, _):
+        await asyncio.sleep(seconds)
+
+    async def _open(self, arguments):
+        # httpx treats an object with both kinds of iterator as one for the blocking client, and rejects it here.
+        if hasattr(arguments.get("content"), "__aiter__"):
+            arguments["content"] = aiter(arguments["content"])
+        response = await self._http.send(self._http.build_request(**arguments), stream=True)
+        return Stream(response, response.aiter_bytes())
+
+    async def _read(self, stream):
+        return await anext(stream.pieces, b"")
+
+    async def _close(self, stream):
+        await stream.response.aclose()
+
+    _iterate = StepClient._items
+
+    async def _collect(self, steps):
+        """Performs an operation and returns its items."""
+        return [item async for item in self._items(steps)]
 
     async def _each(self, operations, concurrency):
         """Yields the results of operations as they complete."""
@@ -264,5 +351,5 @@ class AsyncClient(ClientMethods):
 
 
 # Documentation and pickles name the module that users import.
-for item in (AsyncClient, AsyncJob, Client, Job, MapResult):
+for item in (AsyncBatch, AsyncClient, AsyncJob, Batch, Client, Job, MapResult):
     item.__module__ = "molmesh"

@@ -47,16 +47,32 @@ class Request(NamedTuple):
     body: dict[str, Any] = {}
     # `Output` that gets the content of a response with status 200; None for memory.
     output: Any = None
+    # True if that content is left to `Read` steps.
+    is_stream: bool = False
     # Longest time without progress, s.
     timeout: float = 0.0
 
 
 class Response(NamedTuple):
-    """Response of the service. The content is empty if the output of the request has it."""
+    """Response of the service. The content is empty if the output of the request has it, and a stream if the request is
+    for one.
+    """
 
     status: int
     headers: Any
-    content: bytes
+    content: Any
+
+
+class Read(NamedTuple):
+    """Wait for the next piece of a stream; it is empty at the end."""
+
+    stream: Any
+
+
+class Item(NamedTuple):
+    """One of several results of an operation, which the client passes on before it continues the operation."""
+
+    value: Any
 
 
 class Pause(NamedTuple):
@@ -108,17 +124,21 @@ def read(file):
     raise TypeError(f"found {type(file).__name__}, expected a path or bytes")
 
 
+def name_of(source):
+    """Returns the name of a structure in the service: digest, or id of an archive entry; None for a file."""
+    if isinstance(source, str) and DIGEST.fullmatch(source):
+        return {"structure": source}
+    if isinstance(source, str) and PDB_ID.fullmatch(source):
+        return {"pdb_id": source.lower()}
+    return None
+
+
 class Input:
     """Structure of a request: content of a file, digest of a stored structure, or id of an archive entry."""
 
     def __init__(self, source):
-        self.content, self.name = None, None
-        if isinstance(source, str) and DIGEST.fullmatch(source):
-            self.name = {"structure": source}
-        elif isinstance(source, str) and PDB_ID.fullmatch(source):
-            self.name = {"pdb_id": source.lower()}
-        else:
-            self.content = read(source)
+        self.name = name_of(source)
+        self.content = None if self.name else read(source)
 
     def body(self, map=None):
         """Returns the body of a request, with a map or without."""
@@ -143,6 +163,12 @@ def output_stem(source):
     return (path.with_suffix("") if path.suffix.lower() in COMPRESSED else path).stem
 
 
+def check_folder(path, method):
+    """Rejects the output of several files unless it is an existing folder."""
+    if not os.path.isdir(path):
+        raise NotADirectoryError(errno.ENOTDIR, f"the output of {method}() must be an existing folder", str(path))
+
+
 class Output:
     """Destination of a result: memory, or a new file that replaces `path` at the end of a ``with`` block. After an
     error, `path` is as it was before.
@@ -161,6 +187,8 @@ class Output:
 
     def restart(self):
         """Returns the file, which is empty. An earlier response may have been incomplete."""
+        if self.path is None:
+            return io.BytesIO()
         with self.lock:
             if self.is_discarded:
                 raise OSError(f"{self.path} is not needed any more")
@@ -240,7 +268,11 @@ def retry_delay(response):
 
 
 def is_spent(job):
-    """Returns true if a new job may end differently: this one was cancelled, or failed because of the service."""
+    """Returns true if a new job may end differently: this one was cancelled, or failed because of the service. A batch
+    is spent if it has ended, and a job was cancelled or one of the files on the first page is spent.
+    """
+    if "members" in job:
+        return job["status"] in ENDED and (job["counts"]["dismissed"] > 0 or any(map(is_spent, job["members"])))
     problem = job["problem"] or {}
     return job["status"] == "dismissed" or (job["status"] == "failed" and problem.get("status", 500) >= 500)
 
@@ -260,3 +292,8 @@ def parse_areas(content):
 def job_path(id):
     """Returns the path of a job."""
     return f"/v1/jobs/{urllib.parse.quote(id, safe='')}"
+
+
+def batch_path(id):
+    """Returns the path of a batch."""
+    return f"/v1/batches/{urllib.parse.quote(id, safe='')}"

@@ -1,101 +1,14 @@
-"""Documented methods of the clients and of their jobs. The operations are in ``_session``."""
+"""Documented methods of the clients. The operations are in ``_session``."""
 
-import errno
 import os
 import pathlib
 
-from ._messages import Output
+from ._messages import Output, check_folder
 from ._session import Session
 
 
-class JobMethods:
-    """Methods of a job. `_client` performs its operations."""
-
-    def __init__(self, client, id):
-        self._client, self._id = client, id
-
-    @property
-    def id(self):
-        """Id of the job, from which ``job()`` of a client makes the job again."""
-        return self._id
-
-    def __repr__(self):
-        return f"{type(self).__name__}({self.id!r})"
-
-    def status(self):
-        """Returns the state of the job.
-
-        Returns
-        -------
-        dict
-            Status document of the service: ``status`` (``accepted``, ``running``, ``successful``, ``failed`` or
-            ``dismissed``), ``fraction``, ``stage``, ``problem`` and more.
-        """
-        return self._client._run(self._client._session.job(self.id))
-
-    def wait(self, timeout=None):
-        """Waits until the job has ended.
-
-        Parameters
-        ----------
-        timeout : float, optional
-            Longest time to wait in s; without it, until the service ends the job.
-
-        Returns
-        -------
-        dict
-            The last state, as ``status()`` returns it.
-
-        Raises
-        ------
-        TimeoutError
-            If the job has not ended by then. It continues to run.
-        """
-        return self._client._run(self._client._session.wait(self.id, timeout))
-
-    def result(self, timeout=None, *, save=None):
-        """Returns the mesh or picture, after the job has ended.
-
-        Parameters
-        ----------
-        timeout : float, optional
-            Longest time to wait for the end in s.
-        save : str or os.PathLike, optional
-            File to write instead of returning the content.
-
-        Returns
-        -------
-        bytes or pathlib.Path
-            The content, or the path ``save``.
-
-        Raises
-        ------
-        molmesh.Error
-            If the job failed, with its problem; of the type ``job-dismissed`` if it was cancelled, and ``result-gone``
-            if the service has removed the result.
-        TimeoutError
-            If the job has not ended in time.
-        """
-        return self._client._run(self._client._session.saved_result(self.id, timeout, Output(save)))
-
-    def cancel(self):
-        """Cancels the job.
-
-        Returns
-        -------
-        dict
-            The last state, as ``status()`` returns it.
-
-        Raises
-        ------
-        molmesh.Error
-            Of the type ``job-ended``, if the job succeeded or failed before.
-        """
-        return self._client._run(self._client._session.cancel(self.id))
-
-
 class ClientMethods:
-    """Operations of a client. ``_run`` returns their result, or a coroutine that does."""
+    """Operations of a client. ``_run`` returns their result, or a coroutine that does; ``_iterate`` an iterator."""
 
     def __init__(self, url, key=None, *, timeout=300.0):
         self._session = Session(url, key, timeout)
@@ -284,6 +197,79 @@ class ClientMethods:
         """
         return self._job_type(self, id)
 
+    def jobs(self, state=None):
+        """Lists the asynchronous jobs of the key's group or, without a key, of the client's address.
+
+        Parameters
+        ----------
+        state : str, optional
+            ``accepted``, ``running``, ``successful``, ``failed`` or ``dismissed``; without it, all jobs.
+
+        Returns
+        -------
+        iterator of dict
+            Their states, as ``Job.status()`` returns them, in no particular order; an asynchronous iterator in
+            ``AsyncClient``.
+
+        Examples
+        --------
+        >>> client = molmesh.Client("http://127.0.0.1:8080")
+        >>> job = client.submit("samples/4pti.pdb", resolution=0.9)
+        >>> job.id in [state["jobID"] for state in client.jobs()]
+        True
+        """
+        return self._iterate(self._session.list_items("/v1/jobs", "jobs", [] if state is None else [("state", state)]))
+
+    def submit_batch(self, files, *, outputs="glb", **parameters):
+        """Starts a batch: one request for many files with one set of parameters.
+
+        The same call, even of another process, returns the same batch as long as the service keeps it, unless a job
+        was cancelled or one of the first 100 files failed because of the service. After a timeout, the same call gets
+        the batch, which the service accepts as a whole or not at all.
+
+        Parameters
+        ----------
+        files : iterable or dict
+            Paths of structure files or their contents, or ids of archive entries, but not both. Results have the name
+            of their file without its folder; a dictionary gives other names, such as ``{"native/4pti.pdb": path}``.
+        outputs : str or list of str, optional
+            Formats of meshes and pictures, and ``"areas"`` for a table of exact areas.
+        **parameters
+            As in ``mesh()`` and ``areas()``. Each applies to the outputs that have it.
+
+        Returns
+        -------
+        Batch or AsyncBatch
+            The batch.
+
+        Raises
+        ------
+        molmesh.Error
+            If the service rejects the whole batch. The problem of a file that cannot be used is in ``Batch.files()``
+            instead, and the other files are processed.
+        """
+        _check_several(files)
+
+        def steps():
+            return self.batch((yield from self._session.submit_batch(files, {"outputs": outputs, **parameters})))
+
+        return self._run(steps())
+
+    def batch(self, id):
+        """Returns the batch with an id that ``submit_batch()`` gave, without a request.
+
+        Parameters
+        ----------
+        id : str
+            Id of the batch.
+
+        Returns
+        -------
+        Batch or AsyncBatch
+            The batch.
+        """
+        return self._batch_type(self, id)
+
     def map(self, files, *, format="glb", save=None, concurrency=None, progress=False, **parameters):
         """Meshes many structures with asynchronous jobs, enough at once to keep all workers of the service busy.
 
@@ -320,10 +306,9 @@ class ClientMethods:
         samples/4pti.pdb b'glTF'
         no.pdb [Errno 2] No such file or directory: 'no.pdb'
         """
-        if isinstance(files, (str, bytes, bytearray, memoryview, os.PathLike)):
-            raise TypeError(f"files is one {type(files).__name__}, expected several files, such as a list")
-        if save is not None and not os.path.isdir(save):
-            raise NotADirectoryError(errno.ENOTDIR, "the output of map() must be an existing folder", str(save))
+        _check_several(files)
+        if save is not None:
+            check_folder(save, "map")
         if concurrency is not None and concurrency < 1:
             raise ValueError(f"concurrency is {concurrency}, expected at least 1")
         results = self._each(self._session.outcomes(files, save, {"format": format, **parameters}), concurrency)
@@ -334,6 +319,12 @@ class ClientMethods:
         except ImportError:
             raise ImportError("progress=True needs the package tqdm: pip install tqdm") from None
         return tqdm(results, total=len(files) if hasattr(files, "__len__") else None, unit="file")
+
+
+def _check_several(files):
+    """Rejects a single file."""
+    if isinstance(files, (str, bytes, bytearray, memoryview, os.PathLike)):
+        raise TypeError(f"files is one {type(files).__name__}, expected several files, such as a list")
 
 
 def _extension(path):

@@ -1,10 +1,12 @@
 """Operations of the clients, without input or output.
 
-An operation is a generator. It yields a `Request` and gets its `Response`, or yields a `Pause`, and returns the result
-of the operation. A request without a response is a `ConnectionError` or a `TimeoutError`, which is thrown into the
-generator. The clients only send requests and wait.
+An operation is a generator. It yields a `Request` and gets its `Response`, yields a `Pause`, or a `Read` and gets the
+next piece of a response, and returns the result of the operation. One that has several results yields each as an
+`Item`. A request without a response is a `ConnectionError` or a `TimeoutError`, which is thrown into the generator. The
+clients only send requests and wait.
 """
 
+import hashlib
 import itertools
 import json
 import math
@@ -13,16 +15,20 @@ import pathlib
 import random
 import re
 import secrets
+import tarfile
 import time
 import urllib.parse
 
+from ._batches import ArchiveReader, batch_input, member_path
 from ._messages import (
     ENDED,
     Input,
+    Item,
     MapResult,
     Output,
     Pause,
     Request,
+    batch_path,
     is_spent,
     job_path,
     output_stem,
@@ -139,17 +145,23 @@ class Session:
         return parse_areas((yield from self.exchange(request)).content)
 
     def requests(self, source, map, prefer, parameters, output=None):
-        """Yields the same request with different idempotency keys: those derived from its content, and a random one."""
+        """Yields the requests for a mesh: the same one with different idempotency keys."""
         input, query, map = Input(source), query_pairs(parameters), None if map is None else read(map)
         digest = input.digest(json.dumps(query).encode(), map or b"")
+        request = Request("POST", "/v1/meshes", query, {"Prefer": prefer}, input.body(map), output)
+        return self.with_keys(request, digest)
+
+    def with_keys(self, request, digest):
+        """Yields the same request with different idempotency keys: those derived from a digest of its content, and a
+        random one.
+        """
         for number in range(DERIVED_KEYS + 1):
             key = f"{digest}-{number}" if number < DERIVED_KEYS else secrets.token_hex(32)
-            headers = {"Prefer": prefer, "Idempotency-Key": key}
-            yield Request("POST", "/v1/meshes", query, headers, input.body(map), output)
+            yield request._replace(headers={**request.headers, "Idempotency-Key": key})
 
     def begin(self, requests):
-        """Sends requests for a mesh until one returns the mesh or a usable job. Returns the last response, None if
-        there was no request.
+        """Sends requests for a mesh or a batch until one returns the mesh, or a usable job or batch. Returns the last
+        response, None if there was no request.
         """
         response = None
         for request in requests:
@@ -200,18 +212,94 @@ class Session:
 
     def wait(self, id, timeout):
         """Returns the status document of a job that has ended."""
+        return self.ended(f"job {id}", lambda seconds: self.job(id, seconds), timeout)
+
+    def ended(self, name, show, timeout):
+        """Returns the document of a job or a batch that has ended. `show` is the operation that gets the document; it
+        may wait for the end for some seconds.
+        """
         end = math.inf if timeout is None else time.monotonic() + timeout
         while True:
             begin = time.monotonic()
-            job = yield from self.job(id, int(max(min(LONGEST_WAIT, self.timeout / 2, end - begin), 0)))
-            if job["status"] in ENDED:
-                return job
+            seconds = int(max(min(LONGEST_WAIT, self.timeout / 2, end - begin), 0))
+            document = yield from show(seconds)
+            if document["status"] in ENDED:
+                return document
             now = time.monotonic()
             if now >= end:
-                raise TimeoutError(f"the job {id} is {job['status']} after {timeout} s")
-            # The service answers early if it stops, and at once if there is less than a second left to wait.
-            if now - begin < POLL_PAUSE:
+                raise TimeoutError(f"the {name} is {document['status']} after {timeout} s")
+            # The service answers early if it stops or cannot wait, as for batches, and at once if there is less than a
+            # second left to wait.
+            if now - begin < max(seconds - POLL_PAUSE, POLL_PAUSE):
                 yield Pause(min(POLL_PAUSE, end - now))
+
+    def submit_batch(self, files, parameters):
+        """Returns the id of a batch."""
+        query = query_pairs(parameters)
+        with batch_input(files) as input:
+            digest = hashlib.sha256(input.digest + json.dumps(query).encode()).hexdigest()
+            request = Request("POST", "/v1/batches", query, input.headers, input.body)
+            response = yield from self.begin(self.with_keys(request, digest))
+        return self.document_of(response)["batchID"]
+
+    def batch(self, id):
+        """Returns the state of a batch with its first files."""
+        return self.document(Request("GET", batch_path(id)))
+
+    def cancel_batch(self, id):
+        return self.document(Request("DELETE", batch_path(id)))
+
+    def wait_batch(self, id, timeout, progress=None):
+        """Returns the state of a batch that has ended. `progress` is called with each state until then."""
+
+        def show(_):
+            batch = yield from self.batch(id)
+            if progress is not None:
+                progress(batch)
+            return batch
+
+        return self.ended(f"batch {id}", show, timeout)
+
+    def batch_results(self, id, folder=None):
+        """Yields the results of a batch as they arrive: name and content, or with a folder name and path."""
+        names, n_before = set(), None
+        while True:
+            request = Request("GET", f"{batch_path(id)}/results.tar", is_stream=True)
+            stream = (yield from self.exchange(request)).content
+            archive = ArchiveReader(stream, f"{self.url} cut off the results of the batch {id}")
+            try:
+                while member := (yield from archive.next()):
+                    if member.name in names:
+                        # An earlier response had it.
+                        yield from archive.copy()
+                        continue
+                    with Output(None if folder is None else member_path(member, folder)) as output:
+                        file = output.restart()
+                        yield from archive.copy(file)
+                        content = file.getvalue() if folder is None else None
+                    names.add(member.name)
+                    yield Item((member.name, output.result(content)))
+                return
+            except tarfile.HeaderError as error:
+                raise ConnectionError(f"the service answered without an archive of results: {error}") from None
+            except (ConnectionError, TimeoutError):
+                # Gives up if the last response brought no new result.
+                if n_before == len(names):
+                    raise
+                n_before = len(names)
+            # The service then sends all results at once, so a proxy does not end the response for its pauses.
+            yield from self.wait_batch(id, None)
+
+    def list_items(self, path, name, query):
+        """Yields the items of a list that the service returns in pages."""
+        request = Request("GET", path, [("limit", "1000"), *query])
+        while request is not None:
+            page = yield from self.document(request)
+            yield from map(Item, page[name])
+            following = [link["href"] for link in page["links"] if link["rel"] == "next"]
+            # The address may have another path behind a proxy.
+            query = [urllib.parse.parse_qsl(urllib.parse.urlsplit(href).query) for href in following]
+            request = request._replace(query=query[0]) if query else None
 
     def result(self, job, timeout, output):
         """Returns the result of a job after its end."""

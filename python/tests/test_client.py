@@ -1,7 +1,6 @@
 """Clients, with a real service and with a server that fails."""
 
 import asyncio
-import http.server
 import json
 import pickle
 import subprocess
@@ -13,77 +12,11 @@ import types
 
 import numpy as np
 import pytest
-from conftest import CIF, COMMAND, PDB, Service
+from conftest import CIF, COMMAND, LONG, PDB, FailingServer, Service, caught, problem, variants
 
 import molmesh
 
-# A job of many seconds.
-LONG = {"surface": "ses", "resolution": 0.04, "quality": "high"}
 KEY = "mm_test_" + "0123456789abcdef" * 4
-
-
-@pytest.fixture
-def client(service):
-    with molmesh.Client(service.url) as client:
-        yield client
-
-
-class FailingServer:
-    """Server whose responses a function determines, with the method, the path and the number of the request. `after` is
-    called with the path after the content of a response.
-    """
-
-    def __init__(self, answer, after=lambda path: None):
-        self.n_requests, self.headers, lock = 0, [], threading.Lock()
-
-        class Handler(http.server.BaseHTTPRequestHandler):
-            def work(handler):
-                with lock:
-                    number, self.n_requests = self.n_requests, self.n_requests + 1
-                    self.headers.append(handler.headers)
-                handler.rfile.read(int(handler.headers.get("Content-Length", 0)))
-                status, headers, content = answer(handler.command, handler.path, number)
-                handler.send_response(status)
-                for name, value in {"Content-Length": str(len(content)), **headers}.items():
-                    handler.send_header(name, value)
-                handler.end_headers()
-                handler.wfile.write(content)
-                after(handler.path)
-
-            do_GET = do_POST = do_DELETE = work
-
-            def log_message(self, *_):
-                """Prints nothing."""
-
-        self.server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-        self.server.daemon_threads = True
-        self.url = f"http://127.0.0.1:{self.server.server_address[1]}"
-        threading.Thread(target=self.server.serve_forever, args=(0.02,), daemon=True).start()
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *_):
-        self.server.shutdown()
-        self.server.server_close()
-
-
-def problem(kind, status, headers=None, **members):
-    document = {"type": f"/problems/{kind}", "title": "t", "status": status, "detail": "d", "instance": "i", **members}
-    return status, headers or {}, json.dumps(document).encode()
-
-
-def variants(folder, number):
-    """Writes structures with different digests."""
-    for n in range(number):
-        (folder / f"{n}.pdb").write_bytes(PDB.read_bytes() + b"REMARK %d\n" % n)
-    return sorted(folder.glob("*.pdb"))
-
-
-def caught(function, *args, **given):
-    with pytest.raises(molmesh.Error) as error:
-        function(*args, **given)
-    return error.value
 
 
 def test_meshes_are_those_of_the_package(client, tmp_path):
