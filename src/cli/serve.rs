@@ -20,8 +20,8 @@ use super::survey;
 /// Nice value of compute threads. They get a third of a core that they share with an HTTP thread.
 #[cfg(target_os = "linux")]
 const COMPUTE_NICE: i32 = 5;
-/// Time after which an idle thread for blocking work ends. The allocator returns its memory then. Such work comes to the
-/// threads in turn, so with a longer time all threads of a burst stay, each with the memory of a structure.
+/// Time after which an idle thread for blocking work ends. The allocator returns its memory then. Threads take work in
+/// turn, so a longer time would keep all threads of a burst alive, each with the memory of a structure.
 const IDLE_THREAD: Duration = Duration::from_millis(100);
 
 /// Runs the service until it has been stopped and drained.

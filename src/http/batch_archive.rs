@@ -12,7 +12,7 @@ use flate2::read::{DeflateDecoder, MultiGzDecoder};
 use rawzip::{CompressionMethod, RECOMMENDED_BUFFER_SIZE, ZipArchive};
 use tar::{Archive, Entry, EntryType, PaxExtensions};
 
-use super::batch_names::{MAX_NAME_BYTES, Outputs, check_name};
+use super::batch_names::{MAX_NAME_BYTES, ResultNames, check_name};
 use super::problem::Problem;
 use super::problem_types::ProblemType;
 use crate::jobs::Budget;
@@ -61,8 +61,8 @@ pub(super) fn read(
     visit: impl FnMut(ArchiveEntry) -> Result<(), Problem>,
 ) -> Result<(), Problem> {
     let left = Cell::new(limits.total.saturating_add(1));
-    let outputs = Outputs::new(extensions);
-    let reader = ArchiveReader { limits, budget, control, left: &left, entries: 0, outputs, visit };
+    let results = ResultNames::new(extensions);
+    let reader = ArchiveReader { limits, budget, control, left: &left, entries: 0, results, visit };
     let mut start = [0; 4];
     let n = file.seek(SeekFrom::Start(0)).and_then(|_| file.read(&mut start)).map_err(Problem::internal)?;
     file.seek(SeekFrom::Start(0)).map_err(Problem::internal)?;
@@ -103,7 +103,7 @@ struct ArchiveReader<'a, V> {
     /// Bytes that may still be decompressed; 0 once the limit is exceeded.
     left: &'a Cell<u64>,
     entries: usize,
-    outputs: Outputs<'a>,
+    results: ResultNames<'a>,
     visit: V,
 }
 
@@ -168,7 +168,7 @@ impl<V: FnMut(ArchiveEntry) -> Result<(), Problem>> ArchiveReader<'_, V> {
                 (shown.into_owned(), Err(refused(format!("the name of the entry {why}"))))
             }
         };
-        let content = match valid.and_then(|()| self.outputs.add(&name).map_err(refused)) {
+        let content = match valid.and_then(|()| self.results.add(&name).map_err(refused)) {
             Err(problem) => Err(problem),
             Ok(()) => match content(self) {
                 Ok(bytes) => Ok(bytes),
@@ -240,8 +240,8 @@ impl<V: FnMut(ArchiveEntry) -> Result<(), Problem>> ArchiveReader<'_, V> {
             })?;
         }
         let (mut rest, mut piece) = (archive.into_inner(), vec![0; PIECE]);
-        // An archive that was cut between two entries looks complete otherwise. Writers end it with two empty blocks
-        // and often pad it; a single one, which some writers leave, shows as well that nothing is missing.
+        // Only the empty block shows that the archive was not cut between two entries. Writers should end it with two
+        // and may add more; some write a single one.
         if rest.has_ended {
             return Err(unreadable("it ends without an empty block; it is not complete"));
         }

@@ -4,10 +4,10 @@ use std::collections::BTreeMap;
 
 /// Maximum length of an entry's name, bytes: the usual limit of a file name.
 pub(super) const MAX_NAME_BYTES: usize = 255;
-/// Summary beside the results. No result has its extension.
+/// Name of the summary. No result has its extension.
 pub(super) const SUMMARY: &str = "summary.jsonl";
 
-/// Returns the name of an entry's outputs, without their extension: the entry's own without that of a compression and
+/// Returns the name of an entry's results without their extension: the entry's own without that of a compression and
 /// that of its format.
 pub(super) fn stem(name: &str) -> &str {
     let file = name.rfind('/').map_or(0, |slash| slash + 1);
@@ -36,20 +36,20 @@ pub(super) fn check_name(name: &[u8]) -> Result<&str, &'static str> {
     Ok(name)
 }
 
-/// Results of the entries so far.
-pub(super) struct Outputs<'a> {
+/// Names of the results of the entries so far.
+pub(super) struct ResultNames<'a> {
     /// Extensions of the results of an entry.
     extensions: &'a [&'static str],
     /// Names of the entries, by their stems in lower case, which some file systems do not distinguish.
     stems: BTreeMap<String, String>,
 }
 
-impl<'a> Outputs<'a> {
+impl<'a> ResultNames<'a> {
     pub(super) fn new(extensions: &'a [&'static str]) -> Self {
         Self { extensions, stems: BTreeMap::new() }
     }
 
-    /// Adds an entry. Returns a reason if its results could not be unpacked beside those of an earlier one.
+    /// Adds an entry. Returns the reason if its results cannot be unpacked beside those of an earlier one.
     pub(super) fn add(&mut self, name: &str) -> Result<(), String> {
         let (shown, stem) = (stem(name), stem(name).to_lowercase());
         if let Some(first) = self.stems.get(&stem) {
@@ -76,7 +76,7 @@ impl<'a> Outputs<'a> {
         Ok(())
     }
 
-    /// Describes a file of the results; `None` if there is none of this name in lower case.
+    /// Describes the result that has this name in lower case; `None` if there is none.
     fn describe(&self, file: &str) -> Option<String> {
         if file == SUMMARY {
             return Some("the summary of all results".to_owned());
@@ -103,7 +103,7 @@ mod tests {
     }
 
     #[test]
-    fn outputs_have_the_stem_of_their_entry() {
+    fn results_have_the_stem_of_their_entry() {
         for (name, expected) in [
             ("1crn.cif", "1crn"),
             ("a.b/1crn.cif.gz", "a.b/1crn"),
@@ -118,8 +118,8 @@ mod tests {
 
     #[test]
     fn a_result_is_no_folder_of_others() {
-        let mut outputs = Outputs::new(&["glb", "csv"]);
-        let mut add = |name: &str| outputs.add(name);
+        let mut results = ResultNames::new(&["glb", "csv"]);
+        let mut add = |name: &str| results.add(name);
         for free in
             ["x.pdb", "x.stl/y.pdb", "x.GL/y.pdb", "z.GLB/deep/y.pdb", "w.glb.pdb", "summary.pdb", "a", "a/b.pdb"]
         {

@@ -249,7 +249,7 @@ async fn save(
     let span = TraceSpan::start(&parent, "save", SpanKind::Internal, Instant::now());
     let failed = |error| EndError::Save { error, resolution };
     let pin = jobs.0.store.pin(&key.name(format.name()).map_err(|error| failed(error.into()))?);
-    // The results of a batch are read once, in its archive, and would replace all others.
+    // The results of a batch are usually read once, in its archive, and would evict all others from the cache.
     let is_cached = record.batch.is_none();
     let start = || {
         let (store, finished, limit) = (jobs.0.store.clone(), Arc::clone(&finished), jobs.0.output_bytes);
