@@ -55,7 +55,8 @@ def batch_input(files):
         raise ValueError("a batch has no place for stored structures: expected files, or ids of archive entries")
     if any(names):
         if not all(names):
-            raise ValueError("a batch has files or ids of archive entries, not both")
+            number = names.index(None)
+            raise ValueError(f"a batch has files or ids of archive entries, not both: source {number} is a file")
         ids = [name["pdb_id"] for name in names]
         yield BatchInput({"json": {"pdb_ids": ids}}, {}, json.dumps(ids).encode())
         return
@@ -82,6 +83,9 @@ def write_archive(output, files):
 def files_by_name(sources):
     """Returns the files of a batch by their names in the archive."""
     if isinstance(sources, Mapping):
+        for name in sources:
+            if not isinstance(name, str) or not name.strip("/") or name.endswith("/") or "\0" in name:
+                raise ValueError(f"{name!r} is not the name of a file")
         return dict(sources)
     files = {}
     for source in sources:

@@ -77,7 +77,9 @@ def test_archive_entries_and_wrong_files(client, tmp_path):
     assert [name for name, _ in files] == ["4pti.glb"] and len(summary(lines)) == 2
     digest = client.upload(PDB)
     for files, message in [
-        (["4pti", str(PDB)], "files or ids of archive entries, not both"),
+        (["4pti", str(PDB)], "not both: source 1 is a file"),
+        ({"a/": PDB}, "'a/' is not the name of a file"),
+        ({"a\0b": PDB}, "is not the name of a file"),
         ([digest], "no place for stored structures"),
         ([PDB, PDB.parent / "../samples/4pti.pdb"], "two files have the name 4pti.pdb; name them with a dictionary"),
     ]:

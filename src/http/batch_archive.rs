@@ -80,8 +80,9 @@ fn refused(detail: impl Into<String>) -> Problem {
 }
 
 fn unreadable(error: impl std::fmt::Display) -> Problem {
-    // The library quotes the header.
-    let why: String = error.to_string().chars().take(MAX_REASON).collect();
+    // The library quotes the header, which may be anything.
+    let text = error.to_string();
+    let why: String = text.chars().take(MAX_REASON).map(|c| if c.is_control() { '\u{fffd}' } else { c }).collect();
     refused(format!("the archive cannot be read: {why}"))
         .with("expected", "a tar archive, plain or compressed with gzip, or a zip archive")
 }
@@ -216,7 +217,10 @@ impl<V: FnMut(ArchiveEntry) -> Result<(), Problem>> ArchiveReader<'_, V> {
         let mut archive = Archive::new(Counted::new(reader, self.left, self.control));
         let mut extended = None;
         for entry in archive.entries().map_err(unreadable)?.raw(true) {
-            let mut entry = entry.map_err(|error| self.failed(error))?;
+            let mut entry = entry.map_err(|error| match self.entries {
+                0 => self.failed("it does not begin with the header of an entry"),
+                _ => self.failed(error),
+            })?;
             let kind = entry.header().entry_type();
             if kind.is_gnu_longname() || kind.is_pax_local_extensions() {
                 let name = extended_name(&mut entry, kind).map_err(|error| self.failed(error))?;
@@ -374,5 +378,11 @@ mod tests {
             }
         }
         assert!(names_in(&whole[..entry]).unwrap_err().contains("without an empty block"));
+        let damaged = [&whole[..entry], &b"a\x1b[2J\x07\n".repeat(512)].concat();
+        let error = names_in(&damaged).unwrap_err();
+        assert!(error.contains("numeric field") && !error.contains(char::is_control), "{error}");
+        for other in [include_bytes!("../../samples/4pti.pdb").to_vec(), gzip(b"HEADER"), b"BZh91AY".repeat(100)] {
+            assert!(names_in(&other).unwrap_err().contains("does not begin with the header of an entry"));
+        }
     }
 }

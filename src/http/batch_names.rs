@@ -52,6 +52,9 @@ impl<'a> ResultNames<'a> {
     /// Adds an entry. Returns the reason if its results cannot be unpacked beside those of an earlier one.
     pub(super) fn add(&mut self, name: &str) -> Result<(), String> {
         let (shown, stem) = (stem(name), stem(name).to_lowercase());
+        if let Some(extension) = self.extensions.iter().find(|end| shown.len() + 1 + end.len() > MAX_NAME_BYTES) {
+            return Err(format!("the name of its result `….{extension}` would have more than {MAX_NAME_BYTES} bytes"));
+        }
         if let Some(first) = self.stems.get(&stem) {
             return Err(if first == name {
                 "the archive has an earlier entry of this name".to_owned()
@@ -136,6 +139,8 @@ mod tests {
             let detail = add(refused).unwrap_err();
             assert!(detail.contains(other), "{refused}: {detail}");
         }
+        assert!(add(&"l".repeat(252)).unwrap_err().contains("more than 255 bytes"));
+        assert_eq!(add(&"l".repeat(251)), Ok(()));
         // The refused ones have no results.
         assert_eq!(add("x.glb.pdb"), Ok(()));
     }

@@ -186,11 +186,13 @@ impl Runner {
             let (ticket, lock) = if let Some(ticket) = pool.join(&task, jobs.0.allowed(), &mut on_start)? {
                 (ticket, None)
             } else {
-                let lock = broker.lock(&work).await.ok_or(NoResult::Locked)?;
-                // An earlier process may have ended between storing the result and updating the record.
+                let lock = broker.lock(&work).await;
+                // Another job with the same work may have stored its result. So may an earlier process that ended
+                // before it updated the record.
                 if let Some(stored) = jobs.stored_result(&task).await? {
                     return Ok(stored);
                 }
+                let lock = lock.ok_or(NoResult::Locked)?;
                 // Without the lock, the last attempt may still run on another node.
                 if record.attempts >= jobs.0.config.attempts {
                     return Err(EndError::Poison { attempts: record.attempts }.into());

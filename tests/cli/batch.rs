@@ -398,11 +398,12 @@ fn an_interrupted_batch_is_continued() {
 
     let folder = Folder::new();
     let (out, summary) = (folder.path("out"), folder.path("all.jsonl"));
-    // The second input takes much longer than the test.
-    let inputs = [folder.file("a.pdb", rod()), folder.file("b.pdb", block(20)), folder.file("c.pdb", rod())];
+    // The first input takes much longer than the test.
+    let inputs = [folder.file("b.pdb", block(20)), folder.file("a.pdb", rod()), folder.file("c.pdb", block(20))];
     let flags = ["--resolution", "0.04", "--max-grid-points", "1000000000000", "--max-mesh-bytes", "1000000000000"];
     let mut command = molmesh();
     command.arg("mesh").args(&inputs).arg("-o").arg(&out).args(flags).arg("--summary").arg(&summary);
+    command.args(["--jobs", "2", "--surface", "ses", "--areas", "--table"]).arg(folder.path("all.csv"));
     let mut child = command.stderr(Stdio::piped()).spawn().unwrap();
     let start = Instant::now();
     while !out.join("a.glb").exists() {
@@ -415,17 +416,18 @@ fn an_interrupted_batch_is_continued() {
     let done = child.wait_with_output().unwrap();
     assert_exit(&done, 130);
     assert!(stderr(&done).contains("interrupted; no partial file remains"), "{}", stderr(&done));
-    assert_eq!(files(&out), ["a.glb"]);
+    assert_eq!(files(&out), ["a.csv", "a.glb"]);
+    assert!(!folder.path("all.csv").exists());
     let whole = fs::read(out.join("a.glb")).unwrap();
 
     let mut command = molmesh();
     command.arg("mesh").args(&inputs).arg("-o").arg(&out).args(["--resolution", "2", "--skip-existing", "-q"]);
     assert_exit(&command.arg("--summary").arg(&summary).output().unwrap(), 0);
-    assert_eq!(files(&out), ["a.glb", "b.glb", "c.glb"]);
+    assert_eq!(files(&out), ["a.csv", "a.glb", "b.glb", "c.glb"]);
     assert!(fs::read(out.join("a.glb")).unwrap() == whole, "the file is not written again");
     let lines = lines(&fs::read_to_string(&summary).unwrap());
     let status: Vec<_> = lines.iter().map(|line| line["status"].as_str().unwrap()).collect();
-    assert_eq!(status, ["written", "skipped", "written", "written"]);
+    assert_eq!(status, ["written", "written", "skipped", "written"]);
 }
 
 /// A full disk ends the batch, and the files written before are whole and listed.

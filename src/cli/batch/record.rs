@@ -150,7 +150,11 @@ impl<'a> Record<'a> {
             (None, None) => return Ok(()),
         };
         // The table may be on the same terminal as the bar.
-        self.bar.suspend(|| joined.add(&item.input, &table))
+        match self.bar.suspend(|| joined.add(&item.input, &table)) {
+            // The joined table is discarded then; the files of the input are complete.
+            Err(CliError::Interrupted) => Ok(()),
+            added => added,
+        }
     }
 
     /// Records and prints the error of an input.

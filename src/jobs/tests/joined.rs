@@ -6,8 +6,10 @@ use std::time::{Duration, Instant};
 
 use bytes::Bytes;
 
-use super::{Fixture, MAX_WAIT, SAMPLE, ended, is};
+use super::{Fixture, MAX_WAIT, SAMPLE, ended, is, task};
 use crate::config::JobsConfig;
+use crate::jobs::broker::Broker as _;
+use crate::jobs::coalesced_job::work_key;
 use crate::jobs::durable_job::DurableJob;
 use crate::jobs::{Budget, OnStart, Status};
 
@@ -109,4 +111,13 @@ async fn a_job_waits_for_memory_without_losing_attempts() {
     drop(others);
     ended(&mut seen).await;
     is(&seen, |record| (record.status, record.attempts), &(Status::Successful, 1));
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_job_whose_result_is_stored_ends_while_another_one_has_the_lock_of_the_work() {
+    let fixture = Fixture::new(1, MAX_WAIT).await;
+    fixture.accept().await.unwrap();
+    fixture.all_ended().await;
+    let _lock = fixture.broker.lock(&work_key(&task("a", "2"))).await.expect("no job has the lock");
+    assert_eq!(fixture.accept_from("b").await.unwrap().record.status, Status::Successful);
 }
