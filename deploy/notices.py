@@ -4,8 +4,8 @@
 Covers the crates that cargo links into `molmesh`, and into other packages of the workspace that are named (normal
 dependencies for the target and features), with all their licence and notice files, meshoptimizer, the standard library,
 musl if the target uses it, and third-party parts of the web pages. For a crate without a licence file, the text of a
-licence that it names is used: Apache-2.0, or MIT with its authors. If the crate permits neither, the command fails and
-names it.
+licence that it names is used: Apache-2.0, or MIT with its authors. If the crate permits neither, it has the licence
+files of another crate of its repository. Without any, the command fails and names it.
 
 Usage: deploy/notices.py [--target TRIPLE] [--no-default-features] [--package molmesh-python]
 """
@@ -80,6 +80,15 @@ def fallback_text(package):
     return None
 
 
+def sibling_text(package, packages):
+    """Returns name and text of the licence of another crate of the same repository with the same licence."""
+    for other in packages:
+        if all(package[key] and other[key] == package[key] for key in ("repository", "license")):
+            for path in files(pathlib.Path(other["manifest_path"]).parent):
+                return f"that of {other['name']}", path.read_text(encoding="utf-8", errors="replace")
+    return None
+
+
 def mit(authors):
     """Returns the MIT licence with `authors` as copyright holders."""
     terms = (ROOT / "LICENSE-MIT").read_text()
@@ -104,7 +113,7 @@ def texts(packages, musl):
             add(path.read_text(encoding="utf-8", errors="replace"), f"{who} ({path.relative_to(folder)})")
         # A notice is not a licence.
         if not any(not path.name.lower().startswith("notice") for path in own):
-            text = fallback_text(package)
+            text = fallback_text(package) or sibling_text(package, packages)
             if text is None:
                 missing.append(f"{who}: {package['license']}")
             else:

@@ -12,7 +12,9 @@
 //! 10. **timeout**: a backstop above the body timeout and the job deadline;
 //! 11. **reject parameters** (in `router`): rejects query parameters of operations that have none;
 //! 12. **relabel** (in `router`): sends a mesh as bytes if `Accept` prefers them;
-//! 13. the router. Limits of bodies, queue and memory apply where the resource is used.
+//! 13. **codings** (in `router`): compresses the response for clients that accept it;
+//! 14. **validate** (in `router`): adds an `ETag` to documents, and answers clients that have them;
+//! 15. the router. Limits of bodies, queue and memory apply where the resource is used.
 
 use std::panic::AssertUnwindSafe;
 use std::sync::Arc;

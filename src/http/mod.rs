@@ -30,6 +30,8 @@ mod state;
 
 mod guard;
 
+mod coding;
+
 mod reading;
 
 // Requests: preferences, bodies, structures, parameters.

@@ -26,7 +26,7 @@ pub(super) async fn relabel(request: Request, next: Next) -> Response {
     let is_mesh = |value: &HeaderValue| Format::ALL.iter().any(|format| format.media_type() == value);
     if is_octets && headers.get(CONTENT_TYPE).is_some_and(is_mesh) {
         headers.insert(CONTENT_TYPE, HeaderValue::from_static(OCTETS));
-        headers.insert(VARY, HeaderValue::from_static("accept"));
+        headers.append(VARY, HeaderValue::from_static("accept"));
     }
     response
 }
@@ -95,10 +95,13 @@ fn choose(accept: &str) -> Option<Format> {
 fn range(position: usize, text: &str) -> Option<MediaRange<'_>> {
     let mut parts = text.split(';').map(str::trim);
     let (kind, subtype) = parts.next()?.split_once('/')?;
-    let weight = parts
-        .find_map(|parameter| parameter.strip_prefix("q=").or_else(|| parameter.strip_prefix("Q=")))
-        .map_or(Some(1.0), |q| q.parse::<f64>().ok().filter(|q| (0.0..=1.0).contains(q)))?;
-    Some(MediaRange { kind, subtype, weight, position })
+    Some(MediaRange { kind, subtype, weight: weight(parts)?, position })
+}
+
+/// Returns the weight among the parameters of a member, by default 1; `None` if it is malformed.
+pub(super) fn weight<'a>(mut parameters: impl Iterator<Item = &'a str>) -> Option<f64> {
+    let q = parameters.find_map(|parameter| parameter.strip_prefix("q=").or_else(|| parameter.strip_prefix("Q=")));
+    q.map_or(Some(1.0), |q| q.parse().ok().filter(|q| (0.0..=1.0).contains(q)))
 }
 
 #[cfg(test)]

@@ -8,12 +8,13 @@ use std::sync::{Mutex, PoisonError};
 use axum::extract::Path;
 use axum::extract::rejection::PathRejection;
 use axum::http::header::{
-    ACCEPT_ENCODING, CACHE_CONTROL, CONTENT_ENCODING, CONTENT_SECURITY_POLICY, CONTENT_TYPE, REFERRER_POLICY, VARY,
+    CACHE_CONTROL, CONTENT_ENCODING, CONTENT_SECURITY_POLICY, CONTENT_TYPE, REFERRER_POLICY, VARY,
 };
 use axum::http::{HeaderMap, HeaderName};
 use axum::response::{IntoResponse, Response};
 use bytes::Bytes;
 
+use super::coding::{self, Coding};
 use super::problem::Problem;
 use super::problem_types::ProblemType;
 
@@ -81,7 +82,7 @@ fn answer(request: &HeaderMap, path: &str, instead: &'static str) -> Result<Resp
 
 /// Answers with a file that is compressed with gzip. Inflates it for clients that do not accept gzip.
 fn gzip_file(request: &HeaderMap, bytes: &'static [u8]) -> Result<Response, Problem> {
-    if accepts_gzip(request) {
+    if coding::is_accepted(request, Coding::Gzip) {
         let coding = [(CONTENT_ENCODING, "gzip"), (VARY, "accept-encoding")];
         return Ok((coding, Bytes::from_static(bytes)).into_response());
     }
@@ -101,19 +102,6 @@ fn inflated(bytes: &'static [u8]) -> io::Result<Bytes> {
     let plain = Bytes::from(plain);
     files.insert(bytes.as_ptr().addr(), plain.clone());
     Ok(plain)
-}
-
-/// Returns true if `Accept-Encoding` accepts gzip: by its name, or by `*` if the header does not name it.
-fn accepts_gzip(request: &HeaderMap) -> bool {
-    let values = request.get_all(ACCEPT_ENCODING).iter().filter_map(|value| value.to_str().ok());
-    let codings =
-        values.flat_map(|value| value.split(',')).map(|coding| coding.split_once(';').unwrap_or((coding, "")));
-    let codings: Vec<_> = codings.collect();
-    let accepts = |coding: &str| {
-        let (_, weight) = codings.iter().find(|(name, _)| name.trim().eq_ignore_ascii_case(coding))?;
-        Some(weight.trim().strip_prefix("q=").is_none_or(|q| q.parse() != Ok(0.0)))
-    };
-    accepts("gzip").or_else(|| accepts("*")).unwrap_or(false)
 }
 
 /// Serves the viewer.
@@ -178,28 +166,6 @@ mod tests {
         let [first, second] = [(); 2].map(|()| inflated(file).unwrap());
         assert!(first.len() > file.len());
         assert_eq!(first.as_ptr(), second.as_ptr());
-    }
-
-    #[test]
-    fn gzip_is_accepted_by_name_or_by_wildcard() {
-        for (header, accepted) in [
-            ("gzip", true),
-            ("br, GZIP;q=0.5", true),
-            ("*", true),
-            ("br;q=1, *;q=0.1", true),
-            ("*;q=0, gzip", true),
-            ("", false),
-            ("br", false),
-            ("gzip;q=0", false),
-            ("gzip; q=0.000", false),
-            ("*;q=0", false),
-            ("gzip;q=0, *", false),
-            ("*, gzip;q=0", false),
-        ] {
-            let headers = HeaderMap::from_iter([(ACCEPT_ENCODING, header.parse().unwrap())]);
-            assert_eq!(accepts_gzip(&headers), accepted, "{header}");
-        }
-        assert!(!accepts_gzip(&HeaderMap::new()));
     }
 
     #[test]

@@ -97,8 +97,8 @@ problem_types! {
         "The job is queued or running. `GET /v1/jobs/{id}?wait=20` waits for its end; `/v1/jobs/{id}/events` reports its progress.";
     MethodNotAllowed = "method-not-allowed", METHOD_NOT_ALLOWED, false, "Method not allowed",
         "The `Allow` header lists the methods of the resource.";
-    NotAcceptable = "not-acceptable", NOT_ACCEPTABLE, false, "No acceptable media type",
-        "The server cannot produce any media type in `Accept`. `available` lists the media types of meshes; the parameter `format` selects one directly.";
+    NotAcceptable = "not-acceptable", NOT_ACCEPTABLE, false, "No acceptable representation",
+        "The server cannot produce any media type in `Accept`, or any content coding in `Accept-Encoding`. `available` lists those that it can produce; the parameter `format` selects a media type directly.";
     BodyTimeout = "body-timeout", REQUEST_TIMEOUT, true, "The request body was too slow",
         "The request body was not complete within `limit` ms.";
     JobEnded = "job-ended", CONFLICT, false, "The job has ended",

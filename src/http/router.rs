@@ -5,11 +5,11 @@ use std::time::Duration;
 
 use axum::Router;
 use axum::extract::Request;
-use axum::middleware::{Next, from_fn};
+use axum::middleware::{Next, from_fn, from_fn_with_state};
 use axum::response::{IntoResponse as _, Response};
 
 use super::state::Shared;
-use super::{guard, jobs, middleware, negotiate, operations};
+use super::{coding, conditional, guard, jobs, middleware, negotiate, operations};
 use crate::config::Role;
 
 /// Margin of the backstop timeout over the sum of the regular timeouts.
@@ -26,6 +26,8 @@ pub(super) fn router(app: &Shared) -> Router {
     let is_worker = app.config.server.role == Role::Worker;
     let rows = operations::TABLE.iter().filter(|row| !is_worker || WORKER_PATHS.contains(&row.path));
     let router = rows.fold(Router::new(), |router, row| router.route(row.path, (row.handler)()));
+    let router = router.layer(from_fn(conditional::validate));
+    let router = router.layer(from_fn_with_state(Arc::clone(app), coding::negotiate));
     let router = router.layer(from_fn(negotiate::relabel)).layer(from_fn(reject_parameters));
     let router = router.with_state(Arc::clone(app));
     middleware::apply(router, timeout, app)

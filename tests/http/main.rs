@@ -28,6 +28,7 @@ mod auto;
 mod bad_input;
 mod batches;
 mod cluster;
+mod codings;
 mod config;
 mod config_limits;
 mod config_schema;
