@@ -1,6 +1,6 @@
 // <molmesh-viewer> on a page of another origin: files that become jobs, files that fail, and browsers without WebGL.
 import http from "node:http";
-import { assert, browser, fetchBytes, open, picture, run, silhouette, SERVICE_URL, TIMEOUT_MS } from "./lib.mjs";
+import { assert, browser, deferred, fetchBytes, open, picture, run, silhouette, stablePicture, SERVICE_URL, TIMEOUT_MS } from "./lib.mjs";
 
 const mesh = (await fetchBytes("/v1/pdb/1crn/surface.glb?resolution=1")).bytes;
 const PAGE = `<!doctype html><html lang="en"><meta charset="utf-8"><title>component</title>
@@ -129,6 +129,63 @@ await run({
     await eventOf("load");
     await page.locator("#viewer").click();
     assert.equal(await page.evaluate(() => window.picks), 1);
+  },
+
+  "mesh, colours and legend change together": async () => {
+    const viewer = page.locator("#viewer");
+    const entryOf = (id, more) => `${SERVICE_URL}/v1/pdb/${id}/surface.glb?resolution=1${more}`;
+    const setAttributes = (attributes) => viewer.evaluate((node, all) => Object.entries(all).forEach(([name, value]) => node.setAttribute(name, value)), attributes);
+    const legend = () => page.locator("#viewer .legend").textContent();
+    const menu = page.locator("#viewer select");
+    // Pictures show the surface alone.
+    await viewer.evaluate(({ shadowRoot }) => shadowRoot.querySelectorAll("select, .legend").forEach((node) => (node.style.opacity = "0")));
+    const loaded = async (src) => {
+      await load(src);
+      await eventOf("load");
+      return stablePicture(page, "#viewer");
+    };
+    const share = (a, b) => a.data.filter((value, i) => Math.abs(value - b.data[i]) > 24).length / a.data.length;
+    const [plain, coloured] = [await loaded(entryOf("4pti", "")), await loaded(entryOf("4pti", "&color=residue"))];
+    assert.ok(share(plain, coloured) > 0.02, `${share(plain, coloured)}`);
+    await setAttributes({ scheme: "residue", menu: "" });
+    const first = await loaded(entryOf("1crn", "&atom_ids=true"));
+    const before = await legend();
+    assert.ok(before.includes("THR"), before);
+    // The mesh arrives long after its colours.
+    const [requested, released] = [deferred(), deferred()];
+    await page.route(/4pti\/surface/, async (route) => {
+      requested.resolve();
+      await released.promise;
+      await route.continue();
+    });
+    await Promise.all([page.waitForResponse(/4pti\/colors/), load(entryOf("4pti", "&atom_ids=true"))]);
+    await requested.promise;
+    assert.ok(share(first, await stablePicture(page, "#viewer")) < 0.001);
+    assert.equal(await legend(), before);
+    released.resolve();
+    await eventOf("load");
+    assert.ok(share(coloured, await stablePicture(page, "#viewer")) < 0.002);
+    assert.notEqual(await legend(), before);
+    await page.unroute(/4pti\/surface/);
+    // Colours that are refused leave the previous ones, also in the menu.
+    const kept = await legend();
+    await page.evaluate(() => (window.events = []));
+    await menu.selectOption("entity");
+    assert.match((await eventOf("error")).message, /entit/);
+    assert.deepEqual([await legend(), await menu.inputValue()], [kept, "residue"]);
+    assert.ok(share(coloured, await stablePicture(page, "#viewer")) < 0.002);
+    // Vertices without atoms cannot be coloured.
+    await setAttributes({ scheme: "residue" });
+    assert.ok(share(plain, await loaded(entryOf("4pti", ""))) < 0.002);
+    assert.match((await eventOf("error")).message, /atom_ids=true/);
+    assert.ok((await page.locator("#viewer .legend").isHidden()) && (await menu.isHidden()));
+    // A mesh that cannot be loaded leaves neither legend nor menu.
+    await loaded(entryOf("1crn", "&atom_ids=true"));
+    assert.equal(await legend(), before);
+    await load("/nothing.glb");
+    await eventOf("error");
+    assert.ok((await page.locator("#viewer .legend").isHidden()) && (await menu.isHidden()));
+    await viewer.evaluate((node) => ["scheme", "menu"].forEach((name) => node.removeAttribute(name)));
   },
 
   "a file on another origin needs no preflight": async () => {

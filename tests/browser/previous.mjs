@@ -1,7 +1,7 @@
 // After requests that fail, are cancelled or are superseded, the page still shows and describes the previous surface.
 import { readFileSync } from "node:fs";
 import {
-  assert, assertClean, browser, deferred, drop, fetchBytes, meshesShown, open, run, sample, stablePicture, start,
+  assert, assertClean, axe, browser, deferred, drop, fetchBytes, meshesShown, open, run, sample, stablePicture, start,
   waitForMesh, SERVICE_URL, TIMEOUT_MS,
 } from "./lib.mjs";
 import { packed } from "./meshopt.mjs";
@@ -28,11 +28,27 @@ const described = (p) =>
     chains: document.querySelector("#p-chains").value,
     hint: document.querySelector("#p-chains").placeholder,
     preview: !document.querySelector("#preview").hidden,
+    colours: ["#colour", "#palette", "#single-colour"].map((id) => document.querySelector(id).value),
+    legend: document.querySelector("#legend").textContent,
+    byChain: document.querySelector("#by-chain").checked,
+    sticks: document.querySelector("#sticks").checked,
   }));
 
 const set = async (p, name, value) => {
   await p.locator(`#p-${name}`).fill(value);
   await p.locator(`#p-${name}`).press("Enter");
+};
+/** Chooses a colour scheme. */
+const choose = (scheme) => page.locator("#colour").selectOption(scheme);
+/** Chooses a colour scheme, and waits until the legend names it. */
+const recolour = async (scheme, legend) => {
+  await choose(scheme);
+  await page.locator("#legend", { hasText: legend }).waitFor();
+};
+/** Downloads the shown surface. */
+const downloaded = async (format) => {
+  const [download] = await Promise.all([page.waitForEvent("download"), page.locator(`#formats button[data-format="${format}"]`).click()]);
+  return readFileSync(await download.path());
 };
 const fetchEntry = async (p, id) => {
   await p.locator("#pdb").fill(id);
@@ -156,7 +172,8 @@ await run({
     await unchanged(page, async () => {
       await set(page, "resolution", "0.07");
       await problem.locator("strong").waitFor();
-      assert.match(await problem.textContent(), /^1CRN: The grid would be too large.*as they were before/s);
+      assert.match(await problem.textContent(), /^1CRN: The grid would be too large.*limit.*as they were before/s);
+      assert.deepEqual(await axe(page), []);
     });
     assert.equal(await page.locator("#p-resolution").inputValue(), "");
     await waitForMesh(page, () => problem.getByRole("button", { name: /^Use [\d.]+ Å$/ }).click());
@@ -192,6 +209,77 @@ await run({
     await waitForMesh(page, () => page.locator("#reset-all").click());
   },
 
+  "colours that are refused, cancelled or cannot be fetched leave the previous ones": async () => {
+    await waitForMesh(page, () => page.locator("#by-chain").check());
+    await recolour("bfactor", /\d/);
+    const [low, high] = [page.locator("#legend .low"), page.locator("#legend .high")];
+    const shown = await described(page);
+    const file = await downloaded("glb");
+    assert.ok(file.equals((await fetchBytes("/v1/pdb/1crn/surface.glb?color=bfactor&split=chain")).bytes));
+    // Parts are chains or pockets, not both.
+    await unchanged(page, async () => {
+      await choose("pocket");
+      await problem.locator("strong", { hasText: "1CRN: " }).waitFor();
+    });
+    await unchanged(page, async () => {
+      await set(page, "color_range", "5,1");
+      await problem.locator("p", { hasText: "the lower one first" }).waitFor();
+    });
+    const colors = /\/v1\/pdb\/1crn\/colors/;
+    const held = await hold(page, colors);
+    await unchanged(page, async () => {
+      await choose("element");
+      await held.requested;
+      await page.locator("#busy").waitFor();
+      await page.locator("#cancel").click();
+      await held.release();
+    });
+    assert.ok(await problem.isHidden());
+    // A server that ends during a request.
+    for (const [pattern, act] of [[colors, () => choose("element")], [entry, () => set(page, "isovalue", "0.8")]]) {
+      await page.route(pattern, (route) => route.abort("connectionreset"));
+      await unchanged(page, async () => {
+        await act();
+        await problem.locator("strong", { hasText: "cannot be reached" }).waitFor();
+      });
+      await page.unroute(pattern);
+    }
+    assert.deepEqual(await described(page), shown);
+    assert.ok(file.equals(await downloaded("glb")));
+    // The next success removes the error, and every description follows.
+    await set(page, "color_range", "5,15");
+    await page.locator("#legend", { hasText: /^5\s*15$/ }).waitFor();
+    assert.ok(await problem.isHidden());
+    assert.deepEqual([await low.textContent(), await high.textContent()], ["5", "15"]);
+    const { address, curl } = await described(page);
+    assert.ok(address.includes("color_range=5,15") && curl.includes("color_range=5,15"), `${address} ${curl}`);
+    assert.ok(!file.equals(await downloaded("glb")));
+    // Without a scheme, the service refuses a range.
+    await choose("none");
+    await page.waitForFunction(() => !location.search.includes("color"));
+    await unchanged(page, async () => {
+      await set(page, "color_range", "1,5");
+      await problem.locator("p", { hasText: "color_range" }).waitFor();
+    });
+    await waitForMesh(page, () => page.locator("#reset-all").click());
+  },
+
+  "values that need each other are requested together": async () => {
+    const requests = () => page.requests.filter((line) => entry.test(line)).length;
+    const before = requests();
+    const { address } = await described(page);
+    await set(page, "paper_a", "2");
+    await page.getByText("Also set paper_b").waitFor();
+    assert.equal(await page.locator("#p-paper_a").inputValue(), "2");
+    assert.deepEqual([requests(), (await described(page)).address], [before, address]);
+    await waitForMesh(page, () => set(page, "paper_b", "1000"));
+    assert.ok(await page.locator("#missing").isHidden());
+    const now = await described(page);
+    assert.deepEqual([now.address, now.set], [`${address}&paper_a=2&paper_b=1000`, ["paper_a", "paper_b"]]);
+    assert.ok(now.curl.includes("paper_a=2&paper_b=1000"), now.curl);
+    await waitForMesh(page, () => page.locator("#reset-all").click());
+  },
+
   "a late mesh does not replace a newer one": async () => {
     // A packed mesh waits for its decoder; meanwhile a plain mesh is requested and shown.
     const other = await start(chromium, {
@@ -205,7 +293,8 @@ await run({
     const decoder = await hold(other, /\/assets\/meshopt/);
     await fetchEntry(other, "1crn");
     await decoder.requested;
-    await waitForMesh(other, () => other.locator("#sample").click());
+    await other.locator("#sample").click();
+    await other.locator("#busy").waitFor({ state: "hidden" });
     await unchanged(other, () => decoder.release());
     assert.equal((await described(other)).name, "4PTI");
     assertClean(other);
@@ -263,6 +352,22 @@ await run({
     const now = await described(other);
     assert.equal(now.name, "1CRN");
     assert.match(now.address, /^\/\?pdb=1crn&resolution=/);
+    assertClean(other, /Failed to load resource/);
+    await other.context().close();
+  },
+
+  "after a failed first request, the sample is offered and no control is in vain": async () => {
+    const other = await open(chromium, { viewport, url: `${SERVICE_URL}/?pdb=9xyz` });
+    await other.locator("#problem strong", { hasText: "9XYZ: The archive has no such entry" }).waitFor();
+    const controls = "#formats button, #copy-curl, #copy-url, #turn, #home, #colour, #sticks, #by-chain, #transparency, #find-form button[type=submit]";
+    const disabled = () => other.locator(controls).evaluateAll((nodes) => nodes.map((node) => node.matches(":disabled")));
+    assert.ok((await disabled()).length > 15 && !(await disabled()).includes(false), `${await disabled()}`);
+    await waitForMesh(other, () => other.getByRole("button", { name: "Show the sample" }).click());
+    await other.waitForFunction(() => !document.querySelector("#colour").disabled);
+    assert.ok(!(await disabled()).includes(true), `${await disabled()}`);
+    assert.ok(await other.locator("#problem").isHidden());
+    const { name, address } = await described(other);
+    assert.deepEqual([name, address], ["4PTI", "/"]);
     assertClean(other, /Failed to load resource/);
     await other.context().close();
   },

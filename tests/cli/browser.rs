@@ -56,6 +56,18 @@ fn page_works() {
     drive("page.mjs", &[], &[]);
 }
 
+/// Tests of the page's state, which need the packages of the page but no browser.
+#[test]
+fn state_of_the_page_follows_its_requests() {
+    let web = Path::new(env!("CARGO_MANIFEST_DIR")).join("web");
+    if !web.join("node_modules/.stamp").is_file() {
+        return tools::missing("the packages of the viewer (make web)").unwrap_or_default();
+    }
+    let done = Command::new("node").arg("--test").arg(web.join("test/view.test.mjs")).output().unwrap();
+    let output = String::from_utf8_lossy(&done.stdout);
+    assert!(done.status.success(), "{output}");
+}
+
 #[test]
 fn surfaces_are_coloured_and_recoloured() {
     drive("colors.mjs", &[], &[]);

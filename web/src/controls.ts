@@ -13,6 +13,12 @@ export interface Actions {
   cancel(): void;
   /** Resets all parameters. */
   reset(): void;
+  /** Divides the surface into chains, or joins it. */
+  divide(byChain: boolean): void;
+  /** Draws ligands as sticks, or removes them. */
+  setSticks(on: boolean): void;
+  /** Sets the transparency, per cent; `live` while its slider is dragged. */
+  setTransparency(percent: number, live: boolean): void;
   /** Called when another format is chosen for the command line. */
   formatChanged(): void;
   /** Returns the address of the shown surface in the chosen format; empty if there is none. */
@@ -38,6 +44,10 @@ export function connect(actions: Actions): void {
   $("cancel").addEventListener("click", () => actions.cancel());
   $("reset-all").addEventListener("click", () => actions.reset());
   $("format").addEventListener("change", () => actions.formatChanged());
+  const [byChain, sticks, transparency] = ["by-chain", "sticks", "transparency"].map((id) => $<HTMLInputElement>(id)) as [HTMLInputElement, HTMLInputElement, HTMLInputElement];
+  byChain.addEventListener("change", () => actions.divide(byChain.checked));
+  sticks.addEventListener("change", () => actions.setSticks(sticks.checked));
+  for (const type of ["input", "change"]) transparency.addEventListener(type, () => actions.setTransparency(transparency.valueAsNumber, type === "input"));
   const copies = (id: string, text: () => string) =>
     $(id).addEventListener("click", () => void copy(text()).then(() => actions.copied(), (error: unknown) => actions.copyFailed(error)));
   copies("copy-curl", () => $("curl").textContent ?? "");

@@ -3,15 +3,16 @@
 import type { JobDocument } from "../client/dist/api";
 import type { Client } from "../client/src/client";
 import type { Source } from "./api/structures";
-import { type Choices, stem, surface, UNCACHED } from "./request";
+import { stem, surface, UNCACHED } from "./request";
+import type { Choices } from "./rules";
 import { $, bytes, el } from "./ui/dom";
 
 export class Downloads {
   constructor(
     private readonly client: Client,
     formats: string[],
-    private readonly wanted: (format: string) => { source: Source; choices: Choices } | null,
-    private readonly failed: (error: unknown, source: Source) => void,
+    private readonly file: (format: string) => { source: Source; choices: Choices } | null,
+    private readonly failed: (error: unknown) => void,
   ) {
     const buttons = formats.map((format) => {
       const button = el("button", { type: "button", "data-format": format, "aria-label": `Download as ${format.toUpperCase()}` }, format);
@@ -22,17 +23,17 @@ export class Downloads {
   }
 
   private async save(format: string, button: HTMLButtonElement): Promise<void> {
-    const wanted = this.wanted(format);
-    if (!wanted) return;
+    const file = this.file(format);
+    if (!file) return;
     const status = $("saved");
     button.disabled = true;
     status.textContent = `Making the ${format.toUpperCase()}…`;
     try {
-      const path = surface(wanted.source, format, wanted.choices);
+      const path = surface(file.source, format, file.choices);
       const onProgress = ({ fraction }: JobDocument) => (status.textContent = `Making the ${format.toUpperCase()}: ${Math.round(100 * fraction)} %`);
       const reply = await this.client.file(path, { onProgress, init: UNCACHED });
       const blob = await reply.blob();
-      const name = /filename="([^"]+)"/.exec(reply.headers.get("content-disposition") ?? "")?.[1] ?? `${stem(wanted.source)}.${format}`;
+      const name = /filename="([^"]+)"/.exec(reply.headers.get("content-disposition") ?? "")?.[1] ?? `${stem(file.source)}.${format}`;
       const url = URL.createObjectURL(blob);
       const link = el("a", { href: url, download: name });
       link.click();
@@ -41,7 +42,7 @@ export class Downloads {
       status.textContent = `${name}, ${bytes(blob.size)}`;
     } catch (error) {
       status.textContent = "";
-      this.failed(error, wanted.source);
+      this.failed(error);
     } finally {
       button.disabled = false;
     }

@@ -1,15 +1,15 @@
 /** `<molmesh-viewer src="…/surface.glb">`: a surface in any page. */
 
-import { bytesOf } from "./api/bytes";
 import type { JobDocument } from "../client/dist/api";
 import { Client } from "../client/src/client";
 import { Problem } from "../client/src/problem";
 import type { MolmeshViewerAttributes, MolmeshViewerEvents } from "../client/src/viewer";
+import { atomColors, type AtomColors, colorsPath } from "./api/colors";
 import { asProblem } from "./api/problem";
-import { Colors } from "./colors";
-import { tileFetcher, type TilesetPaths, tilesetAt } from "./large";
-import { Ligands } from "./ligands";
-import { load } from "./scene/load";
+import { tileFetcher, tilesetAt } from "./large";
+import { fetchLigands, type Ligands, ligandsPath } from "./ligands";
+import { draw, fetchMesh, type Mesh, type Scene } from "./mesh";
+import { Slot } from "./queue";
 import { contextOf, transparencyOf } from "./scene/context";
 import { Viewer } from "./scene/viewer";
 import { chooseScheme, fillSchemes, showLegend } from "./ui/legend";
@@ -30,16 +30,29 @@ select { position: absolute; right: .5rem; bottom: .5rem; font: inherit }
 p { margin: 0; padding: 1rem; overflow-wrap: anywhere }
 `;
 
+/** The surface that the element shows. */
+interface ElementScene extends Scene {
+  /** Path of the structure in a service; undefined for other files. */
+  structure: string | undefined;
+  /** Scheme of its colours. */
+  scheme: string;
+}
+
 export class MolmeshViewer extends HTMLElement {
   static readonly observedAttributes: readonly string[] = Object.keys(ATTRIBUTES);
   private readonly client = new Client(document.baseURI, { retries: 0 });
   private viewer: Viewer | null = null;
-  private abort: AbortController | null = null;
+  private readonly meshes = new Slot<Mesh>();
+  private readonly colors = new Slot<AtomColors | null>();
+  private readonly ligands = new Slot<Ligands | null>();
+  private readonly slots = [this.meshes, this.colors, this.ligands];
+  /** Identifies the latest request. */
+  private latest = {};
+  /** The surface on the screen. */
+  private scene: ElementScene | null = null;
   private readonly canvas = document.createElement("canvas");
   private readonly menu = document.createElement("select");
   private readonly legend = document.createElement("div");
-  private colors: Colors | null = null;
-  private ligands: Ligands | null = null;
   /** The content between the tags, shown if there is no surface. */
   private readonly fallback = document.createElement("slot");
   /** The reason why there is no surface, shown if there is no content between the tags. */
@@ -62,9 +75,14 @@ export class MolmeshViewer extends HTMLElement {
     this.reason.setAttribute("role", "alert");
     fillSchemes(this.menu);
     this.menu.setAttribute("aria-label", "Colours");
-    this.menu.addEventListener("change", () => this.setAttribute("scheme", this.menu.value));
+    this.menu.addEventListener("change", () => {
+      // A scheme that was refused can be chosen again.
+      if (this.getAttribute("scheme") === this.menu.value) void this.update();
+      else this.setAttribute("scheme", this.menu.value);
+    });
     this.legend.className = "legend";
     root.append(this.canvas, this.legend, this.menu, this.fallback, this.reason);
+    this.describe();
     this.arrange();
   }
 
@@ -76,26 +94,20 @@ export class MolmeshViewer extends HTMLElement {
     } catch (error) {
       return this.fail(error);
     }
-    this.colors ??= new Colors(this.client, this.viewer, (legend) => showLegend(this.legend, legend), true);
-    this.ligands ??= new Ligands(this.client, this.viewer, () => undefined);
     this.applyAttributes();
-    void this.load(this.src);
+    void this.update();
   }
 
   disconnectedCallback(): void {
-    this.abort?.abort();
-    this.colors?.stop();
-    this.ligands?.clear();
+    this.stop();
     this.viewer?.dispose();
     this.viewer = null;
-    this.colors = null;
-    this.ligands = null;
   }
 
   attributeChangedCallback(name: keyof MolmeshViewerAttributes, before: string | null, after: string | null): void {
     if (!this.viewer || before === after) return;
-    if (name === "src") void this.load(after ?? "");
-    else if (name === "scheme" || name === "sticks") this.paint();
+    if (name === "src" || name === "scheme" || name === "sticks") void this.update();
+    else if (name === "menu") this.describe();
     else this.applyAttributes();
   }
 
@@ -107,34 +119,73 @@ export class MolmeshViewer extends HTMLElement {
     this.setAttribute("src", value);
   }
 
-  /** Loads another file, through a job if the service makes it one. Cancels the previous request. */
-  private async load(src: string): Promise<void> {
-    this.abort?.abort();
-    const { signal } = (this.abort = new AbortController());
-    if (!src) return this.arrange("");
+  /** Shows the surface of the attributes in one step, once everything has arrived. Cancels the previous request. */
+  private async update(): Promise<void> {
+    const { src, client, viewer } = this;
+    const [mine, since] = [(this.latest = {}), performance.now()];
+    if (!src || !viewer) {
+      this.stop();
+      return this.arrange("");
+    }
     try {
+      const { pathname, searchParams, origin } = new URL(src, document.baseURI);
+      const path = /^(.*\/v1\/(?:pdb|structures)\/[^/]+)\/(?:surface\.glb|tileset\.json)$/.exec(pathname)?.[1];
+      const structure = path && origin + path;
+      const scheme = this.getAttribute("scheme") ?? "none";
+      const choices = new Map([...searchParams, ["color", scheme]] as [string, string][]);
+      const colors = structure ? colorsPath(structure, choices) : null;
+      const ligands = structure && this.hasAttribute("sticks") ? ligandsPath(structure, choices) : null;
       const onProgress = ({ status, stage, fraction }: JobDocument) => this.tell("molmesh-progress", { status, stage, fraction });
-      const tileset = tilesetAt(src);
-      const reply = await this.client.file(tileset?.root ?? src, { signal, onProgress });
-      const loaded = await load(await bytesOf(reply));
-      signal.throwIfAborted();
+      const failures: unknown[] = [];
+      const optional = <T>(result: Promise<T>) => result.catch((error: unknown) => void failures.push(error));
+      const [mesh, atoms, sticks] = await Promise.all([
+        this.meshes.request(src, (signal) => fetchMesh(client, { path: src, tileset: tilesetAt(src), isLarge: () => true, signal, onProgress })),
+        optional(this.colors.request(colors, async (signal) => (colors ? atomColors(client, colors, signal) : null))),
+        optional(this.ligands.request(ligands, async (signal) => (ligands && structure ? fetchLigands(client, structure, choices, signal) : null))),
+      ]);
+      if (this.latest !== mine) return;
+      const { scene: previous } = this;
+      // What failed stays as it is on the same surface, and is missing on another one.
+      const kept = mesh === previous?.mesh ? previous : null;
+      let own = atoms === undefined ? { colors: kept?.colors ?? null, scheme: kept?.scheme ?? "none" } : { colors: atoms, scheme };
+      if (own.colors && !hasAtoms(mesh)) {
+        own = { colors: null, scheme: "none" };
+        failures.push(new Error("the attribute `scheme` needs a `src` with atom_ids=true"));
+      }
+      this.scene = { mesh, structure, usesFile: true, ligands: sticks === undefined ? (kept?.ligands ?? null) : sticks, ...own };
+      for (const slot of this.slots) slot.commit();
       // The canvas has a size only while it is visible.
       this.arrange();
-      this.paint();
-      await this.viewer?.show(loaded, true);
-      signal.throwIfAborted();
-      if (tileset) void this.refine(tileset);
-      if (this.hasAttribute("turn")) this.viewer?.turn(true);
-      this.tell("molmesh-load", { report: loaded.extras });
+      const drawn = draw(viewer, this.scene, previous, true);
+      this.describe();
+      for (const failure of failures) this.report(failure);
+      const end = await drawn;
+      // Read by the browser tests.
+      if (own.colors && own.colors !== previous?.colors) performance.measure("molmesh:recolor", { start: since, end, detail: { atoms: own.colors.rgba.length / 4 } });
+      if (mesh === previous?.mesh) return;
+      if (this.latest !== mine) return;
+      if (mesh.tileset) void viewer.refine(mesh.tileset.document, tileFetcher(client), (state) => this.tell("molmesh-tiles", state), (error) => this.report(error));
+      if (this.hasAttribute("turn")) viewer.turn(true);
+      this.tell("molmesh-load", { report: mesh.loaded.extras });
     } catch (error) {
-      if (!signal.aborted) this.fail(error);
+      if (this.latest === mine) this.fail(error);
     }
   }
 
-  /** Shows the tiles of a tileset as the view needs them. */
-  private async refine(tileset: TilesetPaths): Promise<void> {
-    const failed = (error: unknown) => this.report(error);
-    await this.viewer?.refine(tileset.document, tileFetcher(this.client), (state) => this.tell("molmesh-tiles", state), failed);
+  /** Cancels all requests, and forgets the surface. */
+  private stop(): void {
+    this.latest = {};
+    for (const slot of this.slots) slot.cancel();
+    this.scene = null;
+    this.describe();
+  }
+
+  /** Shows the legend and the menu of the surface on the screen. */
+  private describe(): void {
+    const { scene } = this;
+    showLegend(this.legend, scene?.colors?.legend ?? null);
+    chooseScheme(this.menu, scene?.scheme ?? "none");
+    this.menu.hidden = !this.hasAttribute("menu") || !scene?.structure || !hasAtoms(scene.mesh);
   }
 
   /** Shows the canvas, or, with the reason `failure`, the fallback. */
@@ -173,23 +224,7 @@ export class MolmeshViewer extends HTMLElement {
     this.viewer?.move(...move);
   }
 
-  /** Applies the attributes `scheme` and `sticks` to a surface of this service. */
-  private paint(): void {
-    const scheme = this.getAttribute("scheme") ?? "none";
-    chooseScheme(this.menu, scheme);
-    const { pathname, searchParams, origin } = new URL(this.src, document.baseURI);
-    const structure = /^(.*\/v1\/(?:pdb|structures)\/[^/]+)\/(?:surface\.glb|tileset\.json)$/.exec(pathname)?.[1];
-    this.menu.hidden = !this.hasAttribute("menu") || !structure;
-    if (!structure || !this.hasAttribute("sticks")) this.ligands?.clear();
-    if (!structure) return showLegend(this.legend, null);
-    const failed = (error: unknown) => this.report(error);
-    const choices = new Map([...searchParams, ["color", scheme]] as [string, string][]);
-    this.colors?.apply(origin + structure, choices).catch(failed);
-    if (this.hasAttribute("sticks")) this.ligands?.show(origin + structure, choices).catch(failed);
-  }
-
   private applyAttributes(): void {
-    this.paint();
     this.canvas.setAttribute("aria-label", this.getAttribute("alt") ?? "A molecular surface; arrow keys turn it");
     this.style.background = this.getAttribute("background") ?? "";
     this.viewer?.setTransparency(transparencyOf(this.getAttribute("transparency")) / 100);
@@ -206,6 +241,7 @@ export class MolmeshViewer extends HTMLElement {
     const { document } = asProblem(error);
     const words = [document.title, document.detail].filter(Boolean).join(": ");
     const message = this.src ? `${this.src}: ${words}` : words;
+    this.stop();
     this.arrange(message);
     this.tell("molmesh-error", { message, problem: error instanceof Problem ? document : null });
   }
@@ -214,5 +250,8 @@ export class MolmeshViewer extends HTMLElement {
     this.dispatchEvent(new CustomEvent(name, { detail, bubbles: true }));
   }
 }
+
+/** Returns true if the vertices name their atoms. */
+const hasAtoms = ({ loaded }: Mesh): boolean => loaded.parts.some(({ geometry }) => geometry.hasAttribute("_atom"));
 
 if (!customElements.get("molmesh-viewer")) customElements.define("molmesh-viewer", MolmeshViewer);

@@ -3,7 +3,8 @@
 import type { Client } from "../client/src/client";
 import { asProblem } from "./api/problem";
 import type { Source } from "./api/structures";
-import { type Choices, query, surface } from "./request";
+import { query, surface } from "./request";
+import type { Choices } from "./rules";
 import type { FetchTile } from "./scene/tiles";
 
 /** Number of triangles above which a surface is shown in tiles. */

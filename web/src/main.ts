@@ -21,22 +21,23 @@ async function begin(): Promise<void> {
     ]);
     show($("key-form"), false);
     $("version").textContent = `molmesh ${capabilities.version}, ${capabilities.backends.map((b) => b.name).join(", ")} backend`;
-    await page.start(parametersOf(api), formatsOf(api), schemesOf(api), tilesetParametersOf(api));
+    page.start(parametersOf(api), formatsOf(api), schemesOf(api), tilesetParametersOf(api));
   } catch (error) {
     const problem = asProblem(error);
     const asksForKey = error instanceof Problem && [401, 403].includes(problem.document.status);
     show($("key-form"), asksForKey);
     if (asksForKey && !client.key) {
-      page.setCaption("API key required", "The operator of this server provides keys.");
+      $("structure-name").textContent = "API key required";
+      $("structure-title").textContent = "The operator of this server provides keys.";
       $("key").focus();
-    } else page.problem(problem, () => void begin());
+    } else page.fail(problem, { view: null, again: () => void begin() });
   }
 }
 
 $("key-form").addEventListener("submit", (event) => {
   event.preventDefault();
   client.key = $<HTMLInputElement>("key").value.trim();
-  page.clear();
+  page.dismiss();
   void begin();
 });
 void begin();

@@ -1,10 +1,10 @@
 /** A structure with the parameters that the user has set, as a URL and as a shell command. */
 
 import type { Source } from "./api/structures";
-import { displayPairs, type DisplayState, readDisplay } from "./display";
-
-/** Parameters set by the user, by name; all others have their defaults. */
-export type Choices = ReadonlyMap<string, string>;
+import type { Choices } from "./rules";
+import { transparencyOf } from "./scene/context";
+import { textOfView, viewOfText } from "./scene/view";
+import type { Display, View } from "./view";
 
 export function query(choices: Choices, more: Record<string, string> = {}): string {
   const pairs = new Map([...choices, ...Object.entries(more)]);
@@ -59,30 +59,40 @@ export function stem(source: Source): string {
   return (source.summary?.id ?? source.name).replaceAll(/[^\w.-]+/g, "_").replace(/\.(pdb|ent|cif|mmcif|bcif)?(\.gz|\.zst)?$/i, "").toLowerCase() || "surface";
 }
 
-/** Parameters and display of a surface. */
-export interface State {
-  choices: Choices;
-  display: DisplayState;
-}
-
-/** Reads structure and parameters from the page's address, which preserves them for reloading and sharing. */
-export function readAddress(known: ReadonlySet<string>): {
-  choices: Map<string, string>;
-  display: DisplayState;
-  pdb: string;
-  structure: string;
-} {
+/** Reads structure, parameters and display from the page's address, which preserves them for reloading and sharing. */
+export function readAddress(known: ReadonlySet<string>): { choices: Choices; display: Display; pdb: string; structure: string } {
   const pairs = new URLSearchParams(location.search);
+  const text = (name: string) => pairs.get(name) ?? "";
   const choices = new Map([...pairs].filter(([name, value]) => known.has(name) && value !== ""));
-  return { choices, display: readDisplay(pairs), pdb: pairs.get("pdb") ?? "", structure: pairs.get("structure") ?? "" };
+  const display = {
+    sticks: text("sticks") === "true",
+    transparency: transparencyOf(text("transparency")),
+    hidden: text("hide").split(",").filter(Boolean).map(unescaped),
+    camera: textOfView(viewOfText(text("camera"))),
+  };
+  return { choices, display, pdb: text("pdb"), structure: text("structure") };
 }
 
-/** Returns the page's address for a structure, parameters and display. */
-export function addressOf(source: Source, choices: Choices, display: DisplayState | null): string {
-  const name: Record<string, string> = {};
-  if (source.path.startsWith("/v1/pdb/")) name["pdb"] = decodeURIComponent(source.path.slice("/v1/pdb/".length));
-  else if (!source.isSample) name["structure"] = source.path.slice("/v1/structures/".length);
-  return location.pathname + query(new Map(Object.entries(name)), Object.fromEntries([...choices, ...(display ? displayPairs(display) : [])]));
+function unescaped(name: string): string {
+  try {
+    return decodeURIComponent(name);
+  } catch {
+    return name;
+  }
+}
+
+/** Returns the page's address for a view. */
+export function addressOf({ source, choices, display }: View): string {
+  const pairs: Record<string, string> = {};
+  if (source.path.startsWith("/v1/pdb/")) pairs["pdb"] = decodeURIComponent(source.path.slice("/v1/pdb/".length));
+  else if (!source.isSample) pairs["structure"] = source.path.slice("/v1/structures/".length);
+  Object.assign(pairs, Object.fromEntries(choices));
+  if (display.sticks) pairs["sticks"] = "true";
+  if (display.transparency) pairs["transparency"] = String(display.transparency);
+  // Names may contain commas.
+  if (display.hidden.length) pairs["hide"] = display.hidden.map(encodeURIComponent).join(",");
+  if (display.camera) pairs["camera"] = display.camera;
+  return location.pathname + query(new Map(Object.entries(pairs)));
 }
 
 /** Returns the current address of the page, in the form of `addressOf`. */

@@ -2,28 +2,32 @@
 
 import type { Client } from "../client/src/client";
 import { asProblem } from "./api/problem";
-import { tileFetcher, type TilesetPaths } from "./large";
-import { type Choices, surface, UNCACHED } from "./request";
+import { tileFetcher } from "./large";
+import { draw, type Scene } from "./mesh";
+import { surface, UNCACHED } from "./request";
+import type { Choices } from "./rules";
 import type { Source } from "./api/structures";
-import { load, type Loaded } from "./scene/load";
 import { contextOf } from "./scene/context";
 import type { TilesState } from "./scene/tiles";
+import { textOfView, viewOfText } from "./scene/view";
 import { Viewer } from "./scene/viewer";
 import { $, el, show } from "./ui/dom";
-import { listParts } from "./ui/parts";
 import { color } from "./ui/theme";
+import { type Display, PLAIN } from "./view";
+
+/** Time without movement, ms, after which the address contains the view. Browsers limit its changes per second. */
+const REST = 300;
 
 const ABSENT = "This browser has no WebGL 2, so the surface cannot be turned. It is shown as a picture from the server. Report and downloads work as usual.";
 const LOST = "The graphics device was lost. Until it is available again, the surface is shown as a picture from the server.";
 
 /** A surface that is ready for display. */
-export interface Scene {
+export interface StageScene extends Scene {
   source: Source;
+  /** Path of its mesh without colours. */
+  shape: string;
   /** Parameters of its picture. */
   choices: Choices;
-  loaded: Loaded;
-  /** Tileset whose coarsest tile is `loaded`; null for a whole surface. */
-  tileset: TilesetPaths | null;
   /** Its picture, or a message with the reason for its absence; null if the viewer draws it. */
   picture: Blob | string | null;
 }
@@ -32,8 +36,8 @@ export interface Scene {
 export interface StageActions {
   /** Called when the rotation starts or stops. */
   turned(turning: boolean): void;
-  /** Called after parts were shown or hidden. */
-  partsChanged(): void;
+  /** Called when the camera has come to rest, with the new view as text. */
+  moved(camera: string): void;
   /** Called in each frame that shows tiles. */
   tiles(state: TilesState): void;
   /** Called if a tile cannot be loaded. */
@@ -45,56 +49,66 @@ export class Stage {
   private readonly canvas = $<HTMLCanvasElement>("view");
   private readonly image = $<HTMLImageElement>("picture");
   private readonly notice = $("no-webgl");
-  private readonly parts = $("parts");
   private readonly hint = el("p", { class: "hint" });
   private lost = false;
-  /** The shown surface. */
-  private scene: Scene | null = null;
-  /** The last surface that was not a preview. */
-  private kept: Scene | null = null;
+  /** The scene on the screen. */
+  private scene: StageScene | null = null;
+  private display = PLAIN;
+  private rest = 0;
   private fetching: AbortController | null = null;
 
   constructor(private readonly client: Client, private readonly actions: StageActions) {
     const gl = contextOf(this.canvas, false);
     this.viewer = gl && new Viewer(this.canvas, gl, { onTurn: (turning) => actions.turned(turning), onLost: (lost) => this.onLost(lost) });
     if (!this.viewer) this.explain(ABSENT);
+    this.viewer?.controls.addEventListener("change", () => {
+      clearTimeout(this.rest);
+      this.rest = window.setTimeout(() => this.rested(), REST);
+    });
   }
 
-  /** Reads a file, and fetches its picture with `choices` if the viewer does not draw. Does not change the display. */
-  async prepare(bytes: ArrayBuffer, source: Source, choices: Choices, tileset: TilesetPaths | null, signal: AbortSignal): Promise<Scene> {
-    const loaded = await load(bytes);
-    return { source, choices, loaded, tileset, picture: this.draws ? null : await this.picture(source, choices, signal) };
+  /** True if the viewer draws; otherwise pictures from the service are shown. */
+  get draws(): boolean {
+    return this.viewer !== null && !this.lost;
   }
 
-  /** Shows a surface at once, and resolves with the time in the frame after it was drawn. */
-  show(scene: Scene, fresh: boolean, preview: boolean): Promise<number> {
+  /** Shows a scene at once, and resolves with the time in the frame after it was drawn. */
+  show(scene: StageScene): Promise<number> {
+    const { scene: previous, viewer, client, actions } = this;
     this.scene = scene;
     this.fetching?.abort();
-    const drawn = this.viewer?.show(scene.loaded, fresh) ?? Promise.resolve(performance.now());
-    if (this.viewer) listParts(this.parts, this.viewer, () => this.actions.partsChanged());
-    if (scene.tileset) {
-      const { client, actions } = this;
-      void this.viewer?.refine(scene.tileset.document, tileFetcher(client), (state) => actions.tiles(state), (error, again) => actions.failed(error, again));
+    const isOther = scene.source.path !== previous?.source.path;
+    const drawn = viewer ? draw(viewer, scene, previous, isOther) : Promise.resolve(performance.now());
+    if (isOther) this.display = { ...this.display, camera: "" };
+    const { tileset } = scene.mesh;
+    if (tileset && scene.mesh !== previous?.mesh) {
+      void viewer?.refine(tileset.document, tileFetcher(client), (state) => actions.tiles(state), (error, again) => actions.failed(error, again));
     }
-    if (!preview) this.kept = scene;
     if (!this.draws) this.showPicture(scene);
     return drawn;
   }
 
-  /** Replaces a preview by the last full surface. */
-  restore(): void {
-    if (this.kept && this.scene !== this.kept) void this.show(this.kept, false, false);
+  /** Applies the display of the surface that is shown. A camera that the user moves stays if the display has no new one. */
+  apply(display: Display): void {
+    const { viewer, display: previous } = this;
+    if (!viewer || display === previous) return;
+    this.display = display;
+    viewer.hideParts(display.hidden);
+    viewer.setTransparency(display.transparency / 100);
+    if (display.camera !== previous.camera) viewer.view = viewOfText(display.camera);
+  }
+
+  private rested(): void {
+    const camera = this.viewer ? textOfView(this.viewer.view) : "";
+    if (camera === this.display.camera) return;
+    this.display = { ...this.display, camera };
+    this.actions.moved(camera);
   }
 
   /** Applies the colours of the page. */
   theme(): void {
     this.viewer?.theme(color("--stage"), color("--plain"));
     if (!this.image.hidden) void this.redraw();
-  }
-
-  /** True if the viewer draws; otherwise pictures from the service are shown. */
-  private get draws(): boolean {
-    return this.viewer !== null && !this.lost;
   }
 
   private onLost(lost: boolean): void {
@@ -131,7 +145,7 @@ export class Stage {
   }
 
   /** Shows the picture of a scene, or the reason for its absence. */
-  private showPicture(scene: Scene): void {
+  private showPicture(scene: StageScene): void {
     const { picture, source } = scene;
     if (picture === null) {
       // The viewer has stopped drawing since the scene was prepared.
@@ -153,7 +167,7 @@ export class Stage {
    * Fetches a picture, or returns a message with the reason for its absence. Uses fetch, since an image element would
    * send no key. Throws only when `signal` is aborted.
    */
-  private async picture(source: Source, choices: Choices, signal: AbortSignal): Promise<Blob | string> {
+  async picture(source: Source, choices: Choices, signal: AbortSignal): Promise<Blob | string> {
     const { clientWidth, clientHeight } = $("view-home");
     const pixels = Math.min(2, devicePixelRatio);
     const size = (side: number) => String(Math.max(64, Math.min(2048, Math.round(side * pixels))));

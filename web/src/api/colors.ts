@@ -1,6 +1,7 @@
 /** Colours of atoms, for recolouring a surface without requesting a new mesh. */
 
-import { type Choices, query } from "../request";
+import { query } from "../request";
+import type { Choices } from "../rules";
 import type { Client } from "../../client/src/client";
 
 export interface Legend {

@@ -1,12 +1,13 @@
 /** Structures: their paths, summaries and atom labels. */
 
 import type { AtomsDocument, StructureDocument } from "../../client/dist/api";
-import type { Client } from "../../client/src/client";
-import { type Choices, query } from "../request";
+import type { Client, Structure } from "../../client/src/client";
+import { query } from "../request";
+import type { Choices } from "../rules";
 
 /** Source of a mesh: an upload, by the digest of its bytes, or an entry of the archive. */
 export interface Source {
-  /** Path before `/surface.glb`. */
+  /** Path before `/surface.glb`; empty before `find`. */
   path: string;
   /** Display name. */
   name: string;
@@ -14,8 +15,8 @@ export interface Source {
   file: string;
   /** The bytes, for another upload if the service has deleted them. */
   blob?: Blob;
-  /** True if the bytes were uploaded again and have not been meshed since. */
-  resent?: boolean;
+  /** Uploads or finds the structure, and returns its complete source. Absent if this one is complete. */
+  find?: (signal: AbortSignal) => Promise<Source>;
   /** True for the bundled structure, which the page opens by default. */
   isSample?: boolean;
   summary?: StructureDocument;
@@ -40,6 +41,18 @@ export async function stored(client: Client, digest: string, signal: AbortSignal
 export function entry(id: string): Source {
   const name = id.trim();
   return { path: `/v1/pdb/${encodeURIComponent(name.toLowerCase())}`, name: name.toUpperCase(), file: "" };
+}
+
+/** Returns a source that `find` completes, at most once. */
+export function pending(name: string, find: (signal: AbortSignal) => Promise<Source>): Source {
+  let found: Source | undefined;
+  return { path: "", name, file: "", find: async (signal) => (found ??= await find(signal)) };
+}
+
+/** Returns a structure as the client names it. */
+export function named({ path }: Source): Structure {
+  const name = decodeURIComponent(path.slice(path.lastIndexOf("/") + 1));
+  return path.startsWith("/v1/pdb/") ? { pdb: name } : { digest: name };
 }
 
 export interface Atom {

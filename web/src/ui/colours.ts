@@ -2,7 +2,7 @@
 
 import { labelOf, type Legend } from "../api/colors";
 import type { Schemes } from "../api/schema";
-import type { Choices } from "../request";
+import type { Choices } from "../rules";
 import { $, el, show } from "./dom";
 import { chooseScheme, showLegend } from "./legend";
 
@@ -14,35 +14,26 @@ export class ColourControls {
   private readonly single = $<HTMLInputElement>("single-colour");
   private readonly palette = $<HTMLSelectElement>("palette");
 
-  constructor(recolour: (scheme: string) => void, setPalette: (palette: string) => void) {
-    const uniform = () => UNIFORM + this.single.value;
-    const chosen = () => (this.scheme.value === UNIFORM ? uniform() : this.scheme.value);
-    this.scheme.addEventListener("change", () => recolour(chosen()));
-    this.single.addEventListener("change", () => recolour(uniform()));
-    this.palette.addEventListener("change", () => setPalette(this.palette.value));
-  }
-
-  /** Fills the menus. */
-  fill({ all, palettes }: Schemes): void {
+  constructor({ all, palettes }: Schemes, set: (name: string, value: string | undefined) => void) {
     const values = all.map((value) => (value.startsWith(UNIFORM) ? UNIFORM : value));
     this.scheme.replaceChildren(...values.map((value) => el("option", { value }, labelOf(value))));
     this.palette.replaceChildren(...palettes.map((value) => el("option", { value }, value)));
+    const chosen = (scheme: string) => (scheme === "none" ? undefined : scheme === UNIFORM ? UNIFORM + this.single.value : scheme);
+    this.scheme.onchange = () => set("color", chosen(this.scheme.value));
+    this.single.onchange = () => set("color", chosen(UNIFORM));
+    this.palette.onchange = () => set("palette", this.palette.value);
   }
 
-  /** Shows the scheme of the surface. */
-  choose(choices: Choices): void {
+  /** Shows the scheme and the palette of the parameters, and the legend of the surface. */
+  render(choices: Choices, legend: Legend | null): void {
     const scheme = choices.get("color") ?? "none";
     const isSingle = scheme.startsWith(UNIFORM);
     chooseScheme(this.scheme, isSingle ? UNIFORM : scheme);
     show(this.single, isSingle);
     if (isSingle) this.single.value = `#${scheme.slice(UNIFORM.length).replace("#", "").toLowerCase()}`;
-  }
-
-  /** Shows the legend of the surface, and the palettes if the scheme has one. */
-  explain(legend: Legend | null): void {
     showLegend($("legend"), legend);
     show(this.palette, legend?.palette !== undefined);
-    if (legend?.palette) this.palette.value = legend.palette;
+    this.palette.value = choices.get("palette") ?? legend?.palette ?? "";
     show($("colours"), !$("legend").hidden);
   }
 }

@@ -1,0 +1,106 @@
+/** Requests of which only the latest one counts. */
+
+interface Entry<T> {
+  key: unknown;
+  result: Promise<T>;
+  abort: AbortController;
+}
+
+/** Results of one kind: the one on the screen, and the latest one. A new request cancels the one before. */
+export class Slot<T> {
+  private shown: Entry<T> | null = null;
+  private pending: Entry<T> | null = null;
+
+  /** Returns the result with this key. Calls `start` unless it is on the screen or was requested last. */
+  request(key: unknown, start: (signal: AbortSignal) => Promise<T>): Promise<T> {
+    const { pending, shown } = this;
+    if (pending && pending.key === key) return pending.result;
+    this.cancel();
+    if (shown && shown.key === key) return shown.result;
+    const abort = new AbortController();
+    const entry: Entry<T> = { key, result: start(abort.signal), abort };
+    this.pending = entry;
+    // The same request may succeed later.
+    entry.result.catch(() => this.pending === entry && this.cancel());
+    return entry.result;
+  }
+
+  /** The result of the last request is on the screen. */
+  commit(): void {
+    this.shown = this.pending ?? this.shown;
+    this.pending = null;
+  }
+
+  /** Cancels the last request unless its result is on the screen. */
+  cancel(): void {
+    this.pending?.abort.abort();
+    this.pending = null;
+  }
+}
+
+export interface Timed {
+  /** True while a slider is dragged and more requests will follow. */
+  live: boolean;
+  /** Time of the input, by the page's clock. */
+  since: number;
+}
+
+export interface Runner<Request> {
+  /** Runs a request to its end. `signal` is aborted once a later request supersedes it. */
+  run(request: Request, signal: AbortSignal): Promise<void>;
+  failed(error: unknown, request: Request): void;
+  /** Called when no request is running. */
+  idle(): void;
+}
+
+/** Time, ms, that a running request has before a dragged slider replaces it, so that intermediate meshes appear. */
+const GRACE = 250;
+
+export class Queue<Request extends Timed> {
+  private running: { request: Request; abort: AbortController } | null = null;
+  private next: Request | null = null;
+  private timer = 0;
+
+  constructor(private readonly runner: Runner<Request>) {}
+
+  want(request: Request): void {
+    const { running } = this;
+    clearTimeout(this.timer);
+    this.next = request;
+    const age = running && request.live && running.request.live ? performance.now() - running.request.since : GRACE;
+    if (age >= GRACE) this.supersede();
+    else this.timer = window.setTimeout(() => this.supersede(), GRACE - age);
+  }
+
+  /** Cancels the running request. */
+  cancel(): void {
+    clearTimeout(this.timer);
+    this.next = null;
+    this.running?.abort.abort();
+    if (this.running) this.runner.idle();
+    this.running = null;
+  }
+
+  private supersede(): void {
+    clearTimeout(this.timer);
+    const request = this.next;
+    this.next = null;
+    if (!request) return;
+    this.running?.abort.abort();
+    const mine = (this.running = { request, abort: new AbortController() });
+    void this.run(mine);
+  }
+
+  private async run(mine: { request: Request; abort: AbortController }): Promise<void> {
+    try {
+      await this.runner.run(mine.request, mine.abort.signal);
+    } catch (error) {
+      // If a later request is waiting, this one is superseded already.
+      if (this.running === mine && !this.next) this.runner.failed(error, mine.request);
+    }
+    if (this.running !== mine) return;
+    this.running = null;
+    if (this.next) this.supersede();
+    else this.runner.idle();
+  }
+}
