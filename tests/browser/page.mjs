@@ -60,8 +60,11 @@ await run({
     await other.locator("#problem strong").waitFor();
     assert.ok(surfaces(other).at(-1).includes("wobble=0.8"), surfaces(other).at(-1));
     assert.match(await other.locator("#problem").textContent(), /unknown parameter `wobble`/);
+    // The surface shown has no `wobble`, so nothing is requested and no error follows.
+    const before = surfaces(other).length;
     await other.getByRole("button", { name: "Reset wobble", exact: true }).click();
-    assert.ok(await other.locator("#problem").isHidden());
+    await other.locator("#busy").waitFor({ state: "hidden" });
+    assert.deepEqual([await other.locator("#problem").isHidden(), surfaces(other).length], [true, before]);
     assertClean(other, /400 \(Bad Request\)/);
     await other.context().close();
   },
@@ -155,11 +158,17 @@ await run({
     const capabilities = JSON.parse((await fetchBytes("/v1/capabilities")).bytes);
     assert.deepEqual(formats, capabilities.formats.map((f) => f.name));
     for (const format of formats) {
-      const [download] = await Promise.all([page.waitForEvent("download"), page.locator(`#formats button[data-format="${format}"]`).click()]);
+      const button = page.locator(`#formats button[data-format="${format}"]`);
+      await button.hover();
+      if (format !== "png") await page.locator("#size", { hasText: new RegExp(`^${format}: about`, "i") }).waitFor();
+      const size = await page.locator("#size").textContent();
+      const [download] = await Promise.all([page.waitForEvent("download"), button.click()]);
       assert.equal(download.suggestedFilename(), format === "ply-text" ? "4PTI.ply" : `4PTI.${format}`);
       const direct = await fetchBytes(`${structure}/surface.${format}?resolution=0.8`);
       assert.equal(direct.status, 200);
       assert.ok(readFileSync(await download.path()).equals(direct.bytes), format);
+      const kilobytes = Number(/([\d.]+) kB$/.exec(size)?.[1]) || 1000 * Number(/([\d.]+) MB$/.exec(size)?.[1]);
+      assert.ok(format === "png" ? size === "" : Math.abs(1000 * kilobytes - direct.bytes.length) < 0.5 * direct.bytes.length, `${size}: ${direct.bytes.length} bytes`);
       const other = await fetchBytes(`${structure}/surface.${format}?resolution=0.9`);
       assert.ok(!other.bytes.equals(direct.bytes), "meshes of different resolution are equal");
     }

@@ -1,5 +1,5 @@
 // Large surfaces in tiles: levels, atoms, colours, limits, and a lost connection.
-import { assert, assertClean, browser, difference, drop, run, stablePicture, start, waitForMesh, SERVICE_URL, TIMEOUT_MS } from "./lib.mjs";
+import { assert, assertClean, browser, deferred, difference, drop, run, stablePicture, start, waitForMesh, SERVICE_URL, TIMEOUT_MS } from "./lib.mjs";
 
 const chromium = await browser();
 const page = await start(chromium);
@@ -84,6 +84,40 @@ await run({
     assert.ok(await page.locator("#coarse").isVisible());
     assert.match(decodeURIComponent(tileRequests()[0]), /tile=0\/0\/0\/0/);
     assert.ok(page.requests.some((line) => line.includes("/tileset.json?")));
+  },
+  "the report and the sizes are those of the mesh that the buttons download": async () => {
+    const [area, volume] = ["area", "volume"].map((name) => page.locator(`#report tr[data-row="${name}"] td`));
+    // The grid of the whole mesh exceeds the limit of this service.
+    await area.getByText("not available: The grid would be too large").waitFor();
+    assert.match(await page.locator("#size").textContent(), /^GLB: The grid would be too large/);
+    assert.doesNotMatch(await volume.textContent(), /\d/);
+    // A service without this limit.
+    const released = deferred();
+    await page.route("**/v1/estimate", (route) => {
+      const { resolution, compress } = route.request().postDataJSON();
+      return route.fulfill({ json: { accepted: true, problem: null, triangles: 8e6, mesh_bytes: resolution ? 50e6 : compress ? 70e6 : 200e6 } });
+    });
+    await page.route(/\/report\.json/, async (route) => {
+      await released.promise;
+      await route.fulfill({ json: { atoms: 44_800, area: 123_456, volume: 654_321, closed: true } });
+    });
+    await page.locator("#p-isovalue").fill("1.1");
+    await page.locator("#p-isovalue").press("Enter");
+    await area.getByText("computing…").waitFor();
+    assert.doesNotMatch(await volume.textContent(), /\d/);
+    const offers = page.locator("#size button");
+    await offers.nth(1).waitFor();
+    assert.match(await page.locator("#size").textContent(), /^GLB: about 8,000,000 triangles, 200.0 MB/);
+    assert.deepEqual(await offers.allTextContents(), ["1 Å: 50.0 MB", "meshopt: 70.0 MB"]);
+    released.resolve();
+    await area.getByText("123,456 Å²").waitFor();
+    assert.equal(await volume.textContent(), "654,321 Å³");
+    const small = page.waitForRequest((request) => request.url().includes("/surface.glb?resolution=1&isovalue=1.1") && !request.url().includes("atom_ids"));
+    await page.route(/surface\.glb\?resolution=1&isovalue=1\.1$/, (route) => route.fulfill({ body: "glTF" }));
+    await offers.first().click();
+    await small;
+    for (const pattern of ["**/v1/estimate", /\/report\.json/, /surface\.glb\?resolution=1&isovalue=1\.1$/]) await page.unroute(pattern);
+    await settled();
   },
   "finer tiles follow the view, from nested subtrees": async () => {
     const before = await settled();

@@ -6,11 +6,13 @@ import { Problem } from "../client/src/problem";
 import type { MolmeshViewerAttributes, MolmeshViewerEvents } from "../client/src/viewer";
 import { atomColors, type AtomColors, colorsPath } from "./api/colors";
 import { asProblem } from "./api/problem";
+import { keyboard } from "./keyboard";
 import { tileFetcher, tilesetAt } from "./large";
 import { fetchLigands, type Ligands, ligandsPath } from "./ligands";
 import { draw, fetchMesh, type Mesh, type Scene } from "./mesh";
 import { Slot } from "./queue";
 import { contextOf, transparencyOf } from "./scene/context";
+import type { TilesState } from "./scene/tiles";
 import { Viewer } from "./scene/viewer";
 import { chooseScheme, fillSchemes, showLegend } from "./ui/legend";
 
@@ -32,8 +34,8 @@ p { margin: 0; padding: 1rem; overflow-wrap: anywhere }
 
 /** The surface that the element shows. */
 interface ElementScene extends Scene {
-  /** Path of the structure in a service; undefined for other files. */
-  structure: string | undefined;
+  /** Address of the structure in a service; null for other files. */
+  structure: string | null;
   /** Scheme of its colours. */
   scheme: string;
 }
@@ -43,8 +45,8 @@ export class MolmeshViewer extends HTMLElement {
   private readonly client = new Client(document.baseURI, { retries: 0 });
   private viewer: Viewer | null = null;
   private readonly meshes = new Slot<Mesh>();
-  private readonly colors = new Slot<AtomColors | null>();
-  private readonly ligands = new Slot<Ligands | null>();
+  private readonly colors = new Slot<AtomColors>();
+  private readonly ligands = new Slot<Ligands>();
   private readonly slots = [this.meshes, this.colors, this.ligands];
   /** Identifies the latest request. */
   private latest = {};
@@ -71,7 +73,7 @@ export class MolmeshViewer extends HTMLElement {
     this.canvas.tabIndex = 0;
     this.canvas.setAttribute("role", "img");
     this.canvas.addEventListener("click", (event) => this.clicked(event));
-    this.canvas.addEventListener("keydown", (event) => this.pressed(event));
+    keyboard(this.canvas, () => this.viewer);
     this.reason.setAttribute("role", "alert");
     fillSchemes(this.menu);
     this.menu.setAttribute("aria-label", "Colours");
@@ -121,55 +123,64 @@ export class MolmeshViewer extends HTMLElement {
 
   /** Shows the surface of the attributes in one step, once everything has arrived. Cancels the previous request. */
   private async update(): Promise<void> {
-    const { src, client, viewer } = this;
+    const { src, viewer } = this;
     const [mine, since] = [(this.latest = {}), performance.now()];
     if (!src || !viewer) {
       this.stop();
       return this.arrange("");
     }
     try {
-      const { pathname, searchParams, origin } = new URL(src, document.baseURI);
-      const path = /^(.*\/v1\/(?:pdb|structures)\/[^/]+)\/(?:surface\.glb|tileset\.json)$/.exec(pathname)?.[1];
-      const structure = path && origin + path;
-      const scheme = this.getAttribute("scheme") ?? "none";
-      const choices = new Map([...searchParams, ["color", scheme]] as [string, string][]);
-      const colors = structure ? colorsPath(structure, choices) : null;
-      const ligands = structure && this.hasAttribute("sticks") ? ligandsPath(structure, choices) : null;
-      const onProgress = ({ status, stage, fraction }: JobDocument) => this.tell("molmesh-progress", { status, stage, fraction });
-      const failures: unknown[] = [];
-      const optional = <T>(result: Promise<T>) => result.catch((error: unknown) => void failures.push(error));
-      const [mesh, atoms, sticks] = await Promise.all([
-        this.meshes.request(src, (signal) => fetchMesh(client, { path: src, tileset: tilesetAt(src), isLarge: () => true, signal, onProgress })),
-        optional(this.colors.request(colors, async (signal) => (colors ? atomColors(client, colors, signal) : null))),
-        optional(this.ligands.request(ligands, async (signal) => (ligands && structure ? fetchLigands(client, structure, choices, signal) : null))),
-      ]);
+      const { scene, failures } = await this.fetch(src);
       if (this.latest !== mine) return;
       const { scene: previous } = this;
-      // What failed stays as it is on the same surface, and is missing on another one.
-      const kept = mesh === previous?.mesh ? previous : null;
-      let own = atoms === undefined ? { colors: kept?.colors ?? null, scheme: kept?.scheme ?? "none" } : { colors: atoms, scheme };
-      if (own.colors && !hasAtoms(mesh)) {
-        own = { colors: null, scheme: "none" };
-        failures.push(new Error("the attribute `scheme` needs a `src` with atom_ids=true"));
-      }
-      this.scene = { mesh, structure, usesFile: true, ligands: sticks === undefined ? (kept?.ligands ?? null) : sticks, ...own };
+      const { mesh, colors } = (this.scene = scene);
       for (const slot of this.slots) slot.commit();
       // The canvas has a size only while it is visible.
       this.arrange();
-      const drawn = draw(viewer, this.scene, previous, true);
+      const drawing = draw(viewer, scene, previous, true);
       this.describe();
       for (const failure of failures) this.report(failure);
-      const end = await drawn;
+      const drawn = await drawing;
       // Read by the browser tests.
-      if (own.colors && own.colors !== previous?.colors) performance.measure("molmesh:recolor", { start: since, end, detail: { atoms: own.colors.rgba.length / 4 } });
-      if (mesh === previous?.mesh) return;
-      if (this.latest !== mine) return;
-      if (mesh.tileset) void viewer.refine(mesh.tileset.document, tileFetcher(client), (state) => this.tell("molmesh-tiles", state), (error) => this.report(error));
+      const detail = { atoms: (colors?.rgba.length ?? 0) / 4 };
+      if (colors !== previous?.colors) performance.measure("molmesh:recolor", { start: since, end: drawn, detail });
+      if (mesh === previous?.mesh || mesh !== this.scene?.mesh) return;
+      const tiles = (state: TilesState) => this.tell("molmesh-tiles", state);
+      if (mesh.tileset) void viewer.refine(mesh.tileset.document, tileFetcher(this.client), tiles, (error) => this.report(error));
       if (this.hasAttribute("turn")) viewer.turn(true);
       this.tell("molmesh-load", { report: mesh.loaded.extras });
     } catch (error) {
       if (this.latest === mine) this.fail(error);
     }
+  }
+
+  /**
+   * Fetches the surface of the attributes. Colours and sticks that fail stay as they are on the same mesh, and are
+   * missing on another one. Throws if the mesh fails.
+   */
+  private async fetch(src: string): Promise<{ scene: ElementScene; failures: unknown[] }> {
+    const { client } = this;
+    const { pathname, searchParams, origin } = new URL(src, document.baseURI);
+    const path = /^(.*\/v1\/(?:pdb|structures)\/[^/]+)\/(?:surface\.glb|tileset\.json)$/.exec(pathname)?.[1];
+    const structure = path ? origin + path : null;
+    const scheme = this.getAttribute("scheme") ?? "none";
+    const choices = new Map([...searchParams, ["color", scheme]] as [string, string][]);
+    const colors = structure && colorsPath(structure, choices);
+    const ligands = structure && this.hasAttribute("sticks") ? ligandsPath(structure, choices) : null;
+    const onProgress = ({ status, stage, fraction }: JobDocument) => this.tell("molmesh-progress", { status, stage, fraction });
+    const request = { path: src, tileset: tilesetAt(src), isLarge: () => true, onProgress };
+    const failures: unknown[] = [];
+    const optional = <T>(result: Promise<T>) => result.catch((error: unknown) => void failures.push(error));
+    const [mesh, atoms, sticks] = await Promise.all([
+      this.meshes.request(src, (_, signal) => fetchMesh(client, { ...request, signal })),
+      optional(this.colors.request(colors, (address, signal) => atomColors(client, address, signal))),
+      optional(this.ligands.request(ligands, (_, signal) => fetchLigands(client, structure ?? "", choices, signal))),
+    ]);
+    const kept = mesh === this.scene?.mesh ? this.scene : { colors: null, scheme: "none", ligands: null };
+    const isUseless = Boolean(atoms) && !hasAtoms(mesh);
+    if (isUseless) failures.push(new Error("the attribute `scheme` needs a `src` with atom_ids=true"));
+    const colored = atoms === undefined || isUseless ? { colors: kept.colors, scheme: kept.scheme } : { colors: atoms, scheme };
+    return { scene: { mesh, structure, usesFile: true, ligands: sticks === undefined ? kept.ligands : sticks, ...colored }, failures };
   }
 
   /** Cancels all requests, and forgets the surface. */
@@ -211,17 +222,6 @@ export class MolmeshViewer extends HTMLElement {
     const atom = hit && hit.atom >= 0 ? hit.atom : null;
     this.viewer?.mark("pinned", atom === null ? null : [atom, atom]);
     this.tell("molmesh-pick", { atom, point: hit?.point.toArray() ?? null });
-  }
-
-  private pressed(event: KeyboardEvent): void {
-    const step = Math.PI / 18;
-    const moves: Record<string, [number, number, number]> = {
-      ArrowLeft: [-step, 0, 1], ArrowRight: [step, 0, 1], ArrowUp: [0, -step, 1], ArrowDown: [0, step, 1], "+": [0, 0, 1.15], "-": [0, 0, 1 / 1.15],
-    };
-    const move = moves[event.key];
-    if (!move || event.ctrlKey || event.metaKey || event.altKey) return;
-    event.preventDefault();
-    this.viewer?.move(...move);
   }
 
   private applyAttributes(): void {

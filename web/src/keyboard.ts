@@ -1,28 +1,22 @@
-/** Keyboard control of the surface. */
+/** Keyboard control of the surface, on the page and in the component. */
 
-import type { Picker } from "./picker";
 import type { Viewer } from "./scene/viewer";
 
 /** Rotation per key press, radians. */
 const STEP = Math.PI / 18;
+/** Rotation to the right and downwards, and magnification. */
+const MOVES: Record<string, [number, number, number]> = {
+  ArrowLeft: [-STEP, 0, 1], ArrowRight: [STEP, 0, 1], ArrowUp: [0, -STEP, 1], ArrowDown: [0, STEP, 1],
+  "+": [0, 0, 1.15], "=": [0, 0, 1.15], "-": [0, 0, 1 / 1.15],
+};
 
-export function keyboard(home: HTMLElement, viewer: Viewer, picker: Picker): void {
-  const keys: Record<string, () => void> = {
-    ArrowLeft: () => viewer.move(-STEP, 0),
-    ArrowRight: () => viewer.move(STEP, 0),
-    ArrowUp: () => viewer.move(0, -STEP),
-    ArrowDown: () => viewer.move(0, STEP),
-    "+": () => viewer.move(0, 0, 1.15),
-    "=": () => viewer.move(0, 0, 1.15),
-    "-": () => viewer.move(0, 0, 1 / 1.15),
-    Home: () => viewer.reset(),
-    Enter: () => picker.pinMiddle(),
-    Escape: () => picker.release(),
-  };
+/** Moves the view with the keys pressed in `home`, and runs the actions of `more`. */
+export function keyboard(home: HTMLElement, viewer: () => Viewer | null, more: Record<string, () => void> = {}): void {
   home.addEventListener("keydown", (event) => {
-    const key = keys[event.key];
-    if (!key || event.ctrlKey || event.metaKey || event.altKey) return;
+    const move = MOVES[event.key];
+    const act = more[event.key] ?? (move && (() => viewer()?.move(...move)));
+    if (!act || event.ctrlKey || event.metaKey || event.altKey) return;
     event.preventDefault();
-    key();
+    act();
   });
 }

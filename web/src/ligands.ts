@@ -6,12 +6,9 @@ import type { Client } from "../client/src/client";
 import { Problem } from "../client/src/problem";
 import { positions } from "./api/structures";
 import { query } from "./request";
-import type { Choices } from "./rules";
+import { type Choices, SELECTION } from "./rules";
 import { MAX_ATOMS, sticks } from "./scene/sticks";
 import { number } from "./ui/dom";
-
-/** Parameters of the mesh that select atoms, besides `select`. */
-const SHARED = ["model", "chains", "altloc", "assembly"];
 
 export interface Ligands {
   /** Sticks; null if there are none to draw. */
@@ -21,7 +18,7 @@ export interface Ligands {
 
 /** Returns the parameters of the ligands of a mesh, with the copies of its assembly. Includes cofactors and glycans. */
 function ligandSelection(choices: Choices): Choices {
-  return new Map([["select", "ligand"], ...[...choices].filter(([name]) => SHARED.includes(name))]);
+  return new Map([["select", "ligand"], ...[...choices].filter(([name]) => SELECTION.includes(name))]);
 }
 
 export const ligandsPath = (structure: string, choices: Choices): string => structure + query(ligandSelection(choices));

@@ -37,7 +37,6 @@ async function begin(): Promise<void> {
 $("key-form").addEventListener("submit", (event) => {
   event.preventDefault();
   client.key = $<HTMLInputElement>("key").value.trim();
-  page.dismiss();
   void begin();
 });
 void begin();

@@ -1,35 +1,34 @@
 /** Controller of the page: asks for views, and describes the one on the screen. */
 
 import { type Client, Problem } from "../client/src/index";
-import { atomColors, type AtomColors, colorsPath, type Legend } from "./api/colors";
+import type { Legend } from "./api/colors";
 import { asProblem } from "./api/problem";
 import type { Parameter, Schemes } from "./api/schema";
-import { entry, named, pending, type Source, stored, upload } from "./api/structures";
-import { connect } from "./controls";
+import { entry, pending, type Source, stored, upload } from "./api/structures";
 import { Downloads } from "./downloads";
+import { drops } from "./drop";
 import { keyboard } from "./keyboard";
-import { isLarge, tilesetOf } from "./large";
-import { fetchLigands, type Ligands, ligandsPath } from "./ligands";
-import { fetchMesh, type Mesh } from "./mesh";
+import type { Mesh } from "./mesh";
 import { Picker } from "./picker";
 import { Queue, Slot } from "./queue";
-import { addressOf, coarser, curl, currentAddress, drawn, query, readAddress, SAMPLE, surface, UNCACHED, writeAddress } from "./request";
+import { addressOf, curl, currentAddress, query, readAddress, SAMPLE, surface, writeAddress } from "./request";
 import { Rules } from "./rules";
+import { Scenes } from "./scenes";
 import { Stage, type StageScene } from "./stage";
 import { Busy } from "./ui/busy";
 import { ColourControls } from "./ui/colours";
-import { $, el, number, show } from "./ui/dom";
+import { $, copy, el, number, show } from "./ui/dom";
 import { Form } from "./ui/form";
 import { listParts } from "./ui/parts";
 import { showProblem } from "./ui/problem";
-import { type Report, report, storedReport, timingsOf } from "./ui/report";
+import { type Report, report, sharedReport, storedReport, timingsOf } from "./ui/report";
 import { showTiles } from "./ui/tiles";
 import { type Action, current, EMPTY, type Failure, PLAIN, reduce, type State, type View } from "./view";
 
 /** Time from input to frame, ms, above which a dragged slider shows a coarser preview. */
 const PREVIEW_FROM = 200;
 
-interface Request {
+interface ViewRequest {
   view: View;
   /** Grid spacing of a preview, Å; undefined for a full mesh. */
   preview: number | undefined;
@@ -37,13 +36,13 @@ interface Request {
   since: number;
 }
 
-/** What the OpenAPI document of the service defines. */
+/** Rules and controls from the OpenAPI document of the service. */
 interface Service {
   rules: Rules;
   form: Form;
   colours: ColourControls;
-  /** Names of the parameters that apply to tilesets. */
-  ofTilesets: ReadonlySet<string>;
+  downloads: Downloads;
+  scenes: Scenes;
 }
 
 export class Page {
@@ -51,22 +50,17 @@ export class Page {
   private state: State = EMPTY;
   private service: Service | null = null;
   private readonly picker: Picker | null;
-  /** The scene of the view on the screen, without previews. */
-  private scene: StageScene | null = null;
   /** Time from the last input to its frame, ms. */
-  private took = 0;
-  private readonly sources = new Slot<Source>();
-  private readonly meshes = new Slot<Mesh>();
-  private readonly colors = new Slot<AtomColors | null>();
-  private readonly ligands = new Slot<Ligands | null>();
-  private readonly pictures = new Slot<Blob | string | null>();
-  private readonly checks = new Slot<unknown>();
-  private readonly slots = [this.sources, this.meshes, this.colors, this.ligands, this.pictures, this.checks];
-  private readonly queue: Queue<Request>;
+  private latency = 0;
+  private readonly reports = new Slot<Report | null>();
+  private readonly queue: Queue<ViewRequest>;
   /** Structures shown so far, by path, so that returning to one needs no second upload. */
   private readonly visited = new Map<string, Source>();
   private explained: Failure | null = null;
-  private facts = 0;
+  /** True while the page's address names the wanted view, not the one shown. */
+  private isAddressed = false;
+  /** Timer of the report. */
+  private pause = 0;
   private readonly busy = new Busy();
 
   constructor(private readonly client: Client) {
@@ -78,26 +72,28 @@ export class Page {
     });
     const { viewer } = this.stage;
     this.picker = viewer && new Picker(client, viewer, (text) => this.announce(text));
-    if (viewer && this.picker) keyboard($("view-home"), viewer, this.picker);
+    const { picker } = this;
+    keyboard($("view-home"), () => viewer, { Home: () => viewer?.reset(), Enter: () => picker?.pinMiddle(), Escape: () => picker?.release() });
     for (const id of ["turn", "home", "colour", "display"]) show($(id), viewer !== null);
     $("turn").addEventListener("click", () => viewer?.turn(!viewer.isTurning, true));
     $("home").addEventListener("click", () => viewer?.reset());
-    this.queue = new Queue({
-      run: (request, signal) => this.run(request, signal),
-      failed: (error, { view }) => this.refuse(error, view),
-      idle: () => this.busy.hide(),
-    });
+    this.queue = new Queue((request, signal) => this.run(request, signal), (error, { view }) => this.refuse(error, view), () => this.busy.hide());
     this.listen();
+  }
+
+  /** The scene of the view on the screen, without previews. */
+  private get scene(): StageScene | null {
+    return this.service?.scenes.shown ?? null;
   }
 
   /** Builds the form from the OpenAPI document and opens the structure that the address names. */
   start(parameters: Parameter[], formats: string[], schemes: Schemes, ofTilesets: ReadonlySet<string>): void {
     const rules = new Rules(parameters, schemes);
     const set = (name: string, value: string | undefined, live = false) => this.want({ type: "set", name, value }, live);
-    const file = (format: string) => this.state.shown && { source: this.state.shown.source, choices: rules.file(format, this.state.shown.choices) };
-    new Downloads(this.client, formats, file, (error) => this.fail(error, { view: null }));
+    const downloads = new Downloads(this.client, formats, rules, () => this.state.shown, (error) => this.fail(error, { view: null }));
     $("format").replaceChildren(...formats.map((format) => el("option", { value: format }, format)));
-    this.service = { rules, form: new Form(parameters, set), colours: new ColourControls(schemes, set), ofTilesets };
+    const scenes = new Scenes(this.client, this.stage, this.busy, rules, ofTilesets);
+    this.service = { rules, form: new Form(parameters, set), colours: new ColourControls(schemes, set), downloads, scenes };
     this.visit();
   }
 
@@ -107,7 +103,7 @@ export class Page {
     const { pdb, structure, choices, display } = readAddress(this.service.rules.names);
     const known = this.visited.get(`/v1/structures/${structure}`);
     const uploaded = () => known ?? pending(`Structure ${structure.slice(0, 8)}`, (signal) => stored(this.client, structure, signal));
-    this.want({ type: "open", source: pdb ? entry(pdb) : structure ? uploaded() : this.sample(), choices, display });
+    this.want({ type: "open", source: pdb ? entry(pdb) : structure ? uploaded() : this.sample(), choices, display }, false, true);
   }
 
   private sample(): Source {
@@ -118,28 +114,43 @@ export class Page {
   }
 
   private listen(): void {
-    connect({
-      openFile: (file) => this.want({ type: "open", source: pending(file.name, (signal) => upload(this.client, file, file.name, signal)) }),
-      openEntry: (id) => this.want({ type: "open", source: entry(id) }),
-      openSample: () => this.openSample(),
-      cancel: () => this.cancel(),
-      reset: () => this.want({ type: "reset" }),
-      divide: (byChain) => this.want({ type: "set", name: "split", value: byChain ? "chain" : undefined }),
-      setSticks: (on) => this.want({ type: "sticks", on }),
-      setTransparency: (transparency, live) => this.dispatch({ type: "adjust", display: { transparency } }, live),
-      formatChanged: () => this.render(),
-      address: () => {
-        const format = $<HTMLSelectElement>("format").value;
-        const { shown } = this.state;
-        return shown && this.service ? location.origin + surface(shown.source, format, this.service.rules.file(format, shown.choices)) : "";
-      },
-      copied: () => this.announce("Copied"),
-      copyFailed: (error) => this.fail(error, { view: null }),
+    const take = (file: File) => this.want({ type: "open", source: pending(file.name, (signal) => upload(this.client, file, file.name, signal)) });
+    const on = (id: string, type: string, act: (control: HTMLInputElement, event: Event) => void) => {
+      const control = $<HTMLInputElement>(id);
+      control.addEventListener(type, (event) => act(control, event));
+    };
+    on("file", "change", (input) => {
+      const chosen = input.files?.[0];
+      if (chosen) take(chosen);
+      input.value = "";
+    });
+    drops(take);
+    on("pdb-form", "submit", (_, event) => {
+      event.preventDefault();
+      const id = $<HTMLInputElement>("pdb").value.trim();
+      if (id) this.want({ type: "open", source: entry(id) });
+    });
+    on("sample", "click", () => this.openSample());
+    on("cancel", "click", () => this.cancel());
+    on("reset-all", "click", () => this.want({ type: "reset" }));
+    on("by-chain", "change", ({ checked }) => this.want({ type: "set", name: "split", value: checked ? "chain" : undefined }));
+    on("sticks", "change", ({ checked }) => this.want({ type: "sticks", on: checked }));
+    const setTransparency = (transparency: number, live: boolean) => this.dispatch({ type: "adjust", display: { transparency } }, live);
+    on("transparency", "input", ({ valueAsNumber }) => setTransparency(valueAsNumber, true));
+    on("transparency", "change", ({ valueAsNumber }) => setTransparency(valueAsNumber, false));
+    on("format", "change", () => this.render());
+    const copies = (text: string) => void copy(text).then(() => this.announce("Copied"), (error: unknown) => this.fail(error, { view: null }));
+    on("copy-curl", "click", () => copies($("curl").textContent ?? ""));
+    on("copy-url", "click", () => {
+      const { service, state: { shown } } = this;
+      const format = $<HTMLSelectElement>("format").value;
+      if (service && shown) copies(location.origin + surface(shown.source, format, service.rules.file(format, shown.choices)));
     });
     window.addEventListener("popstate", () => {
-      // A step to another fragment of the same address opens nothing.
+      // A step to the surface shown, or to another fragment of its address, opens nothing.
       const { shown } = this.state;
       if (!shown || addressOf(shown) !== currentAddress()) this.visit();
+      else if (this.state.wanted) this.cancel();
     });
   }
 
@@ -153,72 +164,26 @@ export class Page {
     this.render(live, push);
   }
 
-  /** Changes the wanted view and requests it. */
-  private want(action: Action, live = false): void {
+  /** Changes the wanted view and requests it. `isAddressed` if the page's address names it already. */
+  private want(action: Action, live = false, isAddressed = false): void {
     const since = performance.now();
+    this.isAddressed = isAddressed;
     this.dispatch(action);
     const { wanted: view, shown } = this.state;
     if (!view || !this.service) return;
     // A view that lacks parameters waits for them.
     if (this.service.rules.missing(view.choices).length) return this.stop();
-    const isSlow = live && this.scene && this.took > PREVIEW_FROM && view.source.path === shown?.source.path;
+    const isSlow = live && this.scene && this.latency > PREVIEW_FROM && view.source.path === shown?.source.path;
     const spacing = Number(view.choices.get("resolution")) || Number(this.scene?.mesh.loaded.extras["resolution"] ?? 0.5);
-    this.busy.show(view.source.find ? `Reading ${view.source.name}…` : "Meshing…", null, live ? 600 : undefined);
+    this.busy.show(view.source.find ? `Reading ${view.source.name}…` : "Updating the surface…", null, live ? 600 : undefined);
     this.queue.want({ view, preview: isSlow ? Number((2 * spacing).toPrecision(3)) : undefined, live, since });
   }
 
-  private async run(request: Request, signal: AbortSignal): Promise<void> {
-    const { view, preview } = request;
-    const { find } = view.source;
-    if (!find) this.sources.cancel();
-    const source = find ? await this.sources.request(view.source, find) : view.source;
+  /** Shows a view. The page changes in one step, once everything has arrived. */
+  private async run({ view, preview, since }: ViewRequest, signal: AbortSignal): Promise<void> {
+    if (!this.service) return;
+    const scene = await this.service.scenes.fetch(view, preview, signal);
     signal.throwIfAborted();
-    const prepare = (from: Source) => this.prepare({ ...view, source: from }, preview);
-    const scene = await prepare(source).catch(async (error: unknown) => {
-      const { blob, file } = source;
-      // The service stores structures for a limited time; this page still has the bytes.
-      if (!blob || !(error instanceof Problem) || !error.is("no-such-structure")) throw error;
-      return prepare({ ...source, ...(await upload(this.client, blob, file, signal)) });
-    });
-    signal.throwIfAborted();
-    await this.show(request, scene);
-  }
-
-  /** Fetches what a view shows. What is on the screen, or on its way, is not fetched again. */
-  private async prepare({ source, choices, display }: View, preview?: number): Promise<StageScene> {
-    const { client, service, stage } = this;
-    if (!service) throw new Error("the page has not started");
-    const { rules, ofTilesets } = service;
-    const taken = preview === undefined ? choices : coarser(choices, preview);
-    const path = drawn(source, rules.mesh(taken));
-    const shape = drawn(source, rules.shape(taken));
-    const ofVertices = rules.coloursVertices(choices);
-    // A mesh with colours of its own can also have those of its atoms.
-    const known = !ofVertices && this.scene?.shape === shape ? this.scene.mesh : null;
-    const tileset = preview !== undefined || !stage.viewer || ofVertices ? null : tilesetOf(source, rules.mesh(taken), ofTilesets);
-    const onProgress = this.busy.follow.bind(this.busy);
-    if (known) this.meshes.cancel();
-    const mesh = (signal: AbortSignal) =>
-      fetchMesh(client, { path, tileset, isLarge: (headers) => isLarge(Number(headers.get("molmesh-atoms")), taken), signal, onProgress, init: UNCACHED });
-    const colors = stage.viewer && !ofVertices ? colorsPath(source.path, choices) : null;
-    const ligands = stage.viewer && display.sticks ? ligandsPath(source.path, choices) : null;
-    const ofPicture = rules.file("png", taken);
-    const picture = stage.draws ? null : surface(source, "png", ofPicture);
-    // No other request of this view checks these parameters.
-    const unchecked = query(rules.others(choices));
-    const check = unchecked && unchecked !== query(rules.others(this.state.shown?.choices ?? new Map())) ? source.path + unchecked : null;
-    const [loaded, atoms, sticks, image] = await Promise.all([
-      known ?? this.meshes.request(path, mesh),
-      this.colors.request(colors, async (signal) => (colors ? atomColors(client, colors, signal) : null)),
-      this.ligands.request(ligands, async (signal) => (ligands ? fetchLigands(client, source.path, choices, signal) : null)),
-      this.pictures.request(picture, async (signal) => (picture ? stage.picture(source, ofPicture, signal) : null)),
-      this.checks.request(check, async (signal) => check && client.estimate(named(source), { ...Object.fromEntries(choices), format: "png" }, { signal })),
-    ]);
-    return { source, shape, choices: ofPicture, mesh: loaded, colors: atoms, usesFile: ofVertices, ligands: sticks, picture: image };
-  }
-
-  /** Shows a scene. The page changes in one step, once everything is ready. */
-  private async show({ view, preview, since }: Request, scene: StageScene): Promise<void> {
     const { shown: previous } = this.state;
     const { mesh, colors } = scene;
     const { extras } = mesh.loaded;
@@ -240,8 +205,8 @@ export class Page {
       performance.measure("molmesh:recolor", { start: since, end, detail: { atoms: colors.rgba.length / 4, ...times } });
     }
     if (preview !== undefined || mesh === before?.mesh || this.scene !== scene) return;
-    this.took = end - since;
-    if (!mesh.tileset) $("now").textContent += `, ${number(this.took, 3)} ms from input to frame`;
+    this.latency = end - since;
+    if (!mesh.tileset) $("now").textContent += `, ${number(this.latency, 3)} ms from input to frame`;
   }
 
   /** Makes `view` the one that the page describes. */
@@ -251,30 +216,43 @@ export class Page {
     const source = { ...scene.source, atoms: scene.source.atoms ?? (Number(extras["atoms_in_file"]) || undefined) };
     const isOther = previous?.source.path !== source.path;
     const isNew = mesh !== this.scene?.mesh;
-    this.scene = scene;
-    for (const slot of this.slots) slot.commit();
+    this.service?.scenes.commit(scene);
     this.visited.set(source.path, source);
-    // After a step through the history, the address is already set.
-    const push = isOther && previous !== null && addressOf(previous) === currentAddress();
+    const push = isOther && previous !== null && !this.isAddressed;
     this.dispatch({ type: "shown", request: view, source }, false, push);
+    this.service?.downloads.forget();
     if (isOther) this.follow(source);
     if (!isNew) return;
-    this.describe(extras);
+    this.describe(mesh.tileset ? sharedReport(extras, "computing…") : extras);
     $("now").textContent = `${Number(extras["triangles"]).toLocaleString("en")} triangles`;
     if (!previous && !view.display.camera) this.stage.viewer?.turn(true);
     // After a pause without further meshes.
-    clearTimeout(this.facts);
-    this.facts = window.setTimeout(() => void this.complete(scene), 300);
+    clearTimeout(this.pause);
+    this.pause = window.setTimeout(() => void this.complete(scene), 300);
   }
 
-  private async complete({ mesh: { loaded: { extras }, headers }, mesh, source }: StageScene): Promise<void> {
-    const closed = extras["closed"] === true ? "closed" : "not closed";
-    this.announce(`Surface of ${source.name}: ${Number(extras["triangles"]).toLocaleString("en")} triangles, area ${number(Number(extras["area"]), 4)} Å², ${closed}.`);
-    const document = await storedReport(this.client, headers);
+  /** Fetches the report of the mesh that the buttons download. */
+  private async complete({ mesh: { loaded: { extras }, headers, tileset }, mesh, source }: StageScene): Promise<void> {
+    const { triangles, area, closed } = extras;
+    const measures = [`${Number(triangles).toLocaleString("en")} triangles`, `area ${number(Number(area), 4)} Å²`, closed === true ? "closed" : "not closed"];
+    this.announce(`Surface of ${source.name}: ${tileset ? "shown in tiles" : measures.join(", ")}.`);
+    const fetched = (_: Mesh, signal: AbortSignal) => (tileset ? this.wholeReport(source, signal) : storedReport(this.client, headers, signal));
+    const failed = (error: unknown) => sharedReport(extras, `not available: ${asProblem(error).document.title}`);
+    const document = await this.reports.request(mesh, fetched).catch(failed);
     if (document && this.scene?.mesh === mesh) this.describe(document);
   }
 
-  /** Writes what belongs to a structure, whatever its surface is. */
+  /** Fetches the report of the whole surface, of which tiles are shown, if the service accepts its mesh. */
+  private async wholeReport(source: Source, signal: AbortSignal): Promise<Report> {
+    const { service, state: { shown } } = this;
+    if (!service || !shown) throw new Error("no surface is shown");
+    void service.downloads.describe("glb");
+    const { problem } = await service.downloads.estimate("glb");
+    if (problem) throw new Problem(problem);
+    return this.client.json<Report>(`${source.path}/report.json${query(service.rules.file("glb", shown.choices))}`, { signal, headers: { priority: "u=7" } });
+  }
+
+  /** Writes the chains, the assemblies and the atom labels of a structure, which no parameter changes. */
   private follow(source: Source): void {
     const { chains, assemblies } = source.summary ?? {};
     const names = chains?.map(({ name }) => name || "_").slice(0, 12).join(",");
@@ -287,7 +265,7 @@ export class Page {
   private describe(document: Report): void {
     if (!this.scene) return;
     const { mesh } = this.scene;
-    this.service?.form.showValues(mesh.tileset ? { ...document, resolution: undefined } : document);
+    this.service?.form.showValues(document);
     report($("report"), document, timingsOf(mesh.headers, document));
     show($("coarse"), mesh.tileset !== null);
   }
@@ -302,7 +280,7 @@ export class Page {
   /** Ends the running request, and shows the full mesh in place of a preview. */
   private stop(): void {
     this.queue.cancel();
-    for (const slot of this.slots) slot.cancel();
+    this.service?.scenes.cancel();
     this.busy.hide();
     show($("preview"), false);
     if (this.scene) void this.stage.show(this.scene);
@@ -320,11 +298,6 @@ export class Page {
     this.dispatch({ type: "failed", failure: { ...failure, problem } });
     const { document } = problem;
     this.announce([failure.view?.source.name, document.title, document.detail].filter(Boolean).join(": "));
-  }
-
-  /** Hides the error message. */
-  dismiss(): void {
-    this.dispatch({ type: "dismiss" });
   }
 
   /** Writes everything that names or describes the view on the screen; form and menus show the wanted one. */
@@ -356,15 +329,15 @@ export class Page {
     const { source } = shown;
     const { mesh: { loaded: { extras } }, ligands } = scene;
     this.stage.apply(shown.display);
-    listParts($("parts"), this.stage.viewer?.partNames ?? [], shown.display.hidden, (hidden) => this.dispatch({ type: "adjust", display: { hidden } }));
+    const hide = (hidden: string[]) => this.dispatch({ type: "adjust", display: { hidden } });
+    listParts($("parts"), this.stage.viewer?.partNames ?? [], shown.display.hidden, hide);
     $("structure-title").textContent = source.summary?.title ?? String(extras["title"] ?? "");
     document.title = `${source.name} · molmesh`;
     $("sticks-note").textContent = ligands?.note ?? "";
     show($("joined"), shown.choices.get("instances") === "true");
     const format = $<HTMLSelectElement>("format").value || "glb";
     $("curl").textContent = curl(source, format, rules.file(format, shown.choices), location.origin, this.client.key !== "");
-    // The address of a step through the history stays until its view is shown or refused.
-    if (!live && (!wanted || missing.length)) writeAddress(addressOf(shown), push);
+    if (!live && !(wanted && this.isAddressed)) writeAddress(addressOf(shown), push);
   }
 
   private renderProblem(): void {
@@ -375,10 +348,11 @@ export class Page {
     if (!failure) return;
     const name = failure.view?.source.name ?? "";
     const isOther = shown && name && name !== shown.source.name;
-    const kept = isOther ? `The surface shown is still that of ${shown.source.name}.` : shown && name ? "The surface and its parameters are as they were before." : "";
+    const same = shown && name ? "The surface and its parameters are as they were before." : "";
+    const kept = isOther ? `The surface shown is still that of ${shown.source.name}.` : same;
     showProblem($("problem"), failure, kept, {
       set: (parameter, value) => this.want({ type: "set", name: parameter, value, base: failure.view }),
-      close: () => this.dismiss(),
+      close: () => this.dispatch({ type: "dismiss" }),
       sample: shown || !this.service ? undefined : () => this.openSample(),
     });
   }

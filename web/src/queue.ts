@@ -12,13 +12,17 @@ export class Slot<T> {
   private pending: Entry<T> | null = null;
 
   /** Returns the result with this key. Calls `start` unless it is on the screen or was requested last. */
-  request(key: unknown, start: (signal: AbortSignal) => Promise<T>): Promise<T> {
+  request<K extends {}>(key: K, start: (key: K, signal: AbortSignal) => Promise<T>): Promise<T>;
+  /** Returns null, and cancels the last request, if the key is null. */
+  request<K extends {}>(key: K | null, start: (key: K, signal: AbortSignal) => Promise<T>): Promise<T | null>;
+  request<K extends {}>(key: K | null, start: (key: K, signal: AbortSignal) => Promise<T>): Promise<T | null> {
     const { pending, shown } = this;
     if (pending && pending.key === key) return pending.result;
     this.cancel();
+    if (key === null) return Promise.resolve(null);
     if (shown && shown.key === key) return shown.result;
     const abort = new AbortController();
-    const entry: Entry<T> = { key, result: start(abort.signal), abort };
+    const entry: Entry<T> = { key, result: start(key, abort.signal), abort };
     this.pending = entry;
     // The same request may succeed later.
     entry.result.catch(() => this.pending === entry && this.cancel());
@@ -38,32 +42,26 @@ export class Slot<T> {
   }
 }
 
-export interface Timed {
-  /** True while a slider is dragged and more requests will follow. */
-  live: boolean;
-  /** Time of the input, by the page's clock. */
-  since: number;
-}
-
-export interface Runner<Request> {
-  /** Runs a request to its end. `signal` is aborted once a later request supersedes it. */
-  run(request: Request, signal: AbortSignal): Promise<void>;
-  failed(error: unknown, request: Request): void;
-  /** Called when no request is running. */
-  idle(): void;
-}
-
 /** Time, ms, that a running request has before a dragged slider replaces it, so that intermediate meshes appear. */
 const GRACE = 250;
 
-export class Queue<Request extends Timed> {
-  private running: { request: Request; abort: AbortController } | null = null;
-  private next: Request | null = null;
+/** `live` requests come from a slider that is being dragged; `since` is the time of the input, by the page's clock. */
+export class Queue<R extends { live: boolean; since: number }> {
+  private running: { request: R; abort: AbortController } | null = null;
+  private next: R | null = null;
   private timer = 0;
 
-  constructor(private readonly runner: Runner<Request>) {}
+  /**
+   * `run` runs a request to its end; its signal is aborted once a later request supersedes it. `idle` is called when no
+   * request is running.
+   */
+  constructor(
+    private readonly run: (request: R, signal: AbortSignal) => Promise<void>,
+    private readonly failed: (error: unknown, request: R) => void,
+    private readonly idle: () => void,
+  ) {}
 
-  want(request: Request): void {
+  want(request: R): void {
     const { running } = this;
     clearTimeout(this.timer);
     this.next = request;
@@ -77,7 +75,7 @@ export class Queue<Request extends Timed> {
     clearTimeout(this.timer);
     this.next = null;
     this.running?.abort.abort();
-    if (this.running) this.runner.idle();
+    if (this.running) this.idle();
     this.running = null;
   }
 
@@ -88,19 +86,19 @@ export class Queue<Request extends Timed> {
     if (!request) return;
     this.running?.abort.abort();
     const mine = (this.running = { request, abort: new AbortController() });
-    void this.run(mine);
+    void this.follow(mine);
   }
 
-  private async run(mine: { request: Request; abort: AbortController }): Promise<void> {
+  private async follow(mine: { request: R; abort: AbortController }): Promise<void> {
     try {
-      await this.runner.run(mine.request, mine.abort.signal);
+      await this.run(mine.request, mine.abort.signal);
     } catch (error) {
       // If a later request is waiting, this one is superseded already.
-      if (this.running === mine && !this.next) this.runner.failed(error, mine.request);
+      if (this.running === mine && !this.next) this.failed(error, mine.request);
     }
     if (this.running !== mine) return;
     this.running = null;
     if (this.next) this.supersede();
-    else this.runner.idle();
+    else this.idle();
   }
 }

@@ -3,7 +3,7 @@
 import type { Source } from "./api/structures";
 import type { Choices } from "./rules";
 import { transparencyOf } from "./scene/context";
-import { textOfView, viewOfText } from "./scene/view";
+import { cameraText, parseCamera } from "./scene/camera";
 import type { Display, View } from "./view";
 
 export function query(choices: Choices, more: Record<string, string> = {}): string {
@@ -68,7 +68,7 @@ export function readAddress(known: ReadonlySet<string>): { choices: Choices; dis
     sticks: text("sticks") === "true",
     transparency: transparencyOf(text("transparency")),
     hidden: text("hide").split(",").filter(Boolean).map(unescaped),
-    camera: textOfView(viewOfText(text("camera"))),
+    camera: cameraText(parseCamera(text("camera"))),
   };
   return { choices, display, pdb: text("pdb"), structure: text("structure") };
 }

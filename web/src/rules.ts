@@ -11,8 +11,8 @@ const STORAGE = ["compress", "normals", "units", "atom_ids"];
 /** Formats that can repeat a mesh (parameter `instances`). Others contain the joined surface of the assembly. */
 const REPEATING = ["glb", "gltf"];
 
-/** Parameters whose values name parts of one structure. */
-export const PARTS = ["model", "chains", "altloc", "assembly"];
+/** Parameters that select atoms by the names of one structure, unlike `select`. */
+export const SELECTION = ["model", "chains", "altloc", "assembly"];
 
 /** Parameters of colours. Colours of atoms change the shown surface without a new mesh. */
 export const COLORS = ["color", "palette", "color_range", "color_blend"];

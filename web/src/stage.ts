@@ -9,13 +9,13 @@ import type { Choices } from "./rules";
 import type { Source } from "./api/structures";
 import { contextOf } from "./scene/context";
 import type { TilesState } from "./scene/tiles";
-import { textOfView, viewOfText } from "./scene/view";
+import { cameraText, parseCamera } from "./scene/camera";
 import { Viewer } from "./scene/viewer";
 import { $, el, show } from "./ui/dom";
 import { color } from "./ui/theme";
 import { type Display, PLAIN } from "./view";
 
-/** Time without movement, ms, after which the address contains the view. Browsers limit its changes per second. */
+/** Time without movement, ms, after which the address contains the camera. Browsers limit its changes per second. */
 const REST = 300;
 
 const ABSENT = "This browser has no WebGL 2, so the surface cannot be turned. It is shown as a picture from the server. Report and downloads work as usual.";
@@ -26,6 +26,8 @@ export interface StageScene extends Scene {
   source: Source;
   /** Path of its mesh without colours. */
   shape: string;
+  /** Parameters that neither its mesh nor its colours depend on, as a query. */
+  others: string;
   /** Parameters of its picture. */
   choices: Choices;
   /** Its picture, or a message with the reason for its absence; null if the viewer draws it. */
@@ -36,7 +38,7 @@ export interface StageScene extends Scene {
 export interface StageActions {
   /** Called when the rotation starts or stops. */
   turned(turning: boolean): void;
-  /** Called when the camera has come to rest, with the new view as text. */
+  /** Called when the camera has come to rest, with its position as text. */
   moved(camera: string): void;
   /** Called in each frame that shows tiles. */
   tiles(state: TilesState): void;
@@ -75,6 +77,8 @@ export class Stage {
   /** Shows a scene at once, and resolves with the time in the frame after it was drawn. */
   show(scene: StageScene): Promise<number> {
     const { scene: previous, viewer, client, actions } = this;
+    // The camera is relative to its surface.
+    if (this.rest && !viewer?.isTurning) this.rested();
     this.scene = scene;
     this.fetching?.abort();
     const isOther = scene.source.path !== previous?.source.path;
@@ -88,18 +92,20 @@ export class Stage {
     return drawn;
   }
 
-  /** Applies the display of the surface that is shown. A camera that the user moves stays if the display has no new one. */
+  /** Applies the display of the surface on the screen. The camera moves only if `display` has another one. */
   apply(display: Display): void {
     const { viewer, display: previous } = this;
     if (!viewer || display === previous) return;
     this.display = display;
     viewer.hideParts(display.hidden);
     viewer.setTransparency(display.transparency / 100);
-    if (display.camera !== previous.camera) viewer.view = viewOfText(display.camera);
+    if (display.camera !== previous.camera) viewer.view = parseCamera(display.camera);
   }
 
   private rested(): void {
-    const camera = this.viewer ? textOfView(this.viewer.view) : "";
+    clearTimeout(this.rest);
+    this.rest = 0;
+    const camera = this.viewer ? cameraText(this.viewer.view) : "";
     if (camera === this.display.camera) return;
     this.display = { ...this.display, camera };
     this.actions.moved(camera);

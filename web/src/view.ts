@@ -2,7 +2,7 @@
 
 import type { Problem } from "../client/src/problem";
 import type { Source } from "./api/structures";
-import { type Choices, PARTS, type Rules } from "./rules";
+import { type Choices, SELECTION, type Rules } from "./rules";
 
 /** Display of a surface apart from parameters. */
 export interface Display {
@@ -34,7 +34,7 @@ export interface Failure {
 export interface State {
   /** The view on the screen. Caption, legend, address, command line, report and downloads describe it. */
   readonly shown: View | null;
-  /** The view that replaces it once everything has arrived; null if none was asked for. Form and menus show its values. */
+  /** The view that replaces it once everything has arrived; null if there is none. Form and menus show its values. */
   readonly wanted: View | null;
   /** The last failure. It ends with the next request and with the next view shown. */
   readonly failure: Failure | null;
@@ -107,10 +107,10 @@ export function reduce(state: State, action: Action, rules: Rules | null): State
   }
 }
 
-/** Returns the view of another structure. Names of parts apply to one structure only. */
+/** Returns the view of another structure. Names of chains and the like apply to one structure only. */
 function opened(previous: View | null, { source, choices, display }: Extract<Action, { type: "open" }>): View {
   const isOther = source.path === "" || source.path !== previous?.source.path;
-  const shared = [...(previous?.choices ?? [])].filter(([name]) => !isOther || !PARTS.includes(name));
+  const shared = [...(previous?.choices ?? [])].filter(([name]) => !isOther || !SELECTION.includes(name));
   const { display: before = PLAIN } = previous ?? {};
   return {
     source,

@@ -68,7 +68,7 @@ test("without a surface to return to, a refused view can be corrected", () => {
   assert.deepEqual(values(act(failed, set("detail", "2")).wanted), { detail: "2" });
 });
 
-test("another structure keeps the values that do not name parts of the previous one", () => {
+test("another structure keeps the values that do not select atoms by names of the previous one", () => {
   const before = show(act(shown, set("chains", "A"), { type: "sticks", on: true }));
   const hidden = act(before, { type: "adjust", display: { hidden: ["A"], camera: "1,2,3", transparency: 40 } });
   for (const other of [source("4pti"), upload]) {
@@ -133,7 +133,7 @@ test("the mesh depends on the colours of vertices only, and files on what their 
 test("a slot keeps the result on the screen, and cancels a request that another one replaces", async () => {
   const slot = new Slot();
   const requests = [];
-  const ask = (key, result) => slot.request(key, (signal) => (requests.push({ key, signal }), result));
+  const ask = (key, result) => slot.request(key, (_, signal) => (requests.push({ key, signal }), result));
   await ask("a", Promise.resolve(1));
   slot.commit();
   const slow = ask("b", new Promise(() => undefined));
@@ -144,4 +144,6 @@ test("a slot keeps the result on the screen, and cancels a request that another 
   slot.commit();
   assert.equal(await ask("a"), 1);
   assert.equal(await ask("c", Promise.resolve(3)), 3);
+  assert.equal(await ask(null), null);
+  assert.equal(requests.at(-1).signal.aborted, true);
 });

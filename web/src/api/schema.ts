@@ -18,8 +18,6 @@ export interface Parameter {
   fallbackWords: string;
   /** Values of choices. */
   values: string[];
-  /** Allowed values, in words. */
-  expected: string;
   /** The only output format that it applies to; empty if it applies to all. */
   format: string;
   /** Parameters that exclude it. */
@@ -130,7 +128,6 @@ function parameterOf(api: OpenApi, parameter: Described): Parameter {
     fallback: value === undefined || value === null ? undefined : String(value),
     fallbackWords: words ?? (value === undefined ? "absent" : String(value)),
     values: schema.enum ?? [],
-    expected: schema.title ?? "",
     format: format ?? "",
     insteadOf: insteadOf ?? [],
   };

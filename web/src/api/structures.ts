@@ -73,10 +73,6 @@ export interface Atom {
 export class Labels {
   constructor(private readonly document: AtomsDocument) {}
 
-  get count(): number {
-    return this.document.count;
-  }
-
   /** Returns the atom in `row`. */
   of(row: number): Atom | null {
     const { atoms, names, elements, residues, count } = this.document;
@@ -111,7 +107,7 @@ export class Labels {
     };
     const at = words.length ? residues.first.findIndex((_, i) => fits(i)) : -1;
     if (at < 0) return null;
-    const [first, end] = [residues.first[at] ?? 0, residues.first[at + 1] ?? this.count];
+    const [first, end] = [residues.first[at] ?? 0, residues.first[at + 1] ?? this.document.count];
     for (let row = first; row < end; row += 1) if (["CA", "P", "C1'"].includes(names[atoms.name[row] ?? -1] ?? "")) return this.of(row);
     return this.of(first);
   }

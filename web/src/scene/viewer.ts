@@ -1,6 +1,6 @@
 /** Viewer of a surface on a canvas. Draws only when something has changed. */
 
-import { type BufferGeometry, type DataTexture, Mesh, PerspectiveCamera, Raycaster, Scene, SRGBColorSpace, Vector2, type Vector3, WebGLRenderer } from "three";
+import { type BufferGeometry, type DataTexture, Mesh, PerspectiveCamera, Raycaster, Scene, SRGBColorSpace, Vector2, WebGLRenderer } from "three";
 import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
 import type { ViewerOptions } from "./context";
 import { type Loaded, type Part, unitScale } from "./load";
@@ -10,7 +10,7 @@ import { Rotation } from "./rotation";
 import { Sharpness } from "./sharpness";
 import { type Rows, Style } from "./style";
 import type { FetchTile, Tiles, TilesState } from "./tiles";
-import { bound, FRONT, moved, place, type View, viewOf } from "./view";
+import { bound, type CameraView, FRONT, moved, place, viewOf } from "./camera";
 
 export class Viewer {
   readonly controls: OrbitControls;
@@ -123,25 +123,9 @@ export class Viewer {
     return (this.loaded?.parts ?? []).filter((_, i) => this.meshes[i]?.visible);
   }
 
-  /** Returns the names of the visible parts. */
-  get shownParts(): string[] {
-    return this.partNames.filter((name) => !this.hidden.has(name));
-  }
-
-  /** Returns the names of the hidden parts. */
-  get hiddenParts(): string[] {
-    return this.partNames.filter((name) => this.hidden.has(name));
-  }
-
   /** Returns the names of the parts. Instances of a part share its name. */
   get partNames(): string[] {
     return [...new Set((this.loaded?.parts ?? []).map(({ name }) => name))];
-  }
-
-  /** Shows or hides the parts with this name. */
-  showPart(name: string, visible: boolean): void {
-    const others = [...this.hidden].filter((other) => other !== name);
-    this.hideParts(visible ? others : [...others, name]);
   }
 
   /** Hides the parts with these names and shows all others, also in the following surfaces. */
@@ -212,11 +196,11 @@ export class Viewer {
   }
 
   /** View of the surface; the initial one without a surface. */
-  get view(): View {
+  get view(): CameraView {
     return this.loaded ? viewOf(this.camera, this.controls.target, this.loaded.sphere) : FRONT;
   }
 
-  set view(view: View) {
+  set view(view: CameraView) {
     if (!this.loaded) return;
     place(this.camera, this.controls.target, this.loaded.sphere, view);
     this.clip();
@@ -269,13 +253,6 @@ export class Viewer {
     return true;
   }
 
-  /** Projects a point of the scene to the canvas, in the coordinates of `pick`. */
-  project(place: Vector3): { x: number; y: number } {
-    this.camera.updateMatrixWorld();
-    const { x, y } = place.clone().project(this.camera);
-    return { x, y };
-  }
-
   /** Marks atoms by first and last row, inclusive; null marks none. */
   mark(which: "hovered" | "pinned", rows: Rows | null): void {
     if (this.style.mark(which, rows)) this.restyle();
@@ -302,12 +279,6 @@ export class Viewer {
   /** Returns the number of triangles of all parts, or of the tiles that replace them. */
   get triangles(): number {
     return (this.tiles ? this.shown : (this.loaded?.parts ?? [])).reduce((sum, { geometry }) => sum + (geometry.getIndex()?.count ?? 0) / 3, 0);
-  }
-
-  /** Waits until drawing has finished, since the GPU works asynchronously. For measurements. */
-  finish(): void {
-    const gl = this.renderer.getContext();
-    gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4));
   }
 
   dispose(): void {

@@ -46,16 +46,31 @@ function frame(parameter: Parameter, changed: Changed) {
   });
   name.after(help);
   const element = el("div", { class: "field", "data-parameter": parameter.name }, head, doc);
-  reset.addEventListener("click", () => changed(parameter.name, undefined, false));
-  const mark = (set: boolean) => {
-    reset.hidden = !set;
-    element.classList.toggle("is-set", set);
+  reset.addEventListener("click", () => set(undefined));
+  const set = (value: string | undefined, live = false) => changed(parameter.name, value, live);
+  /** Returns the field. `update` shows its value in the control. */
+  const create = (update: (value: string | undefined) => void, effective: Field["effective"] = () => undefined, offer?: Field["offer"]): Field => {
+    let value: string | undefined;
+    update(value);
+    return {
+      parameter,
+      element,
+      get value() { return value; },
+      set value(next) {
+        value = next;
+        update(value);
+        reset.hidden = value === undefined;
+        element.classList.toggle("is-set", value !== undefined);
+      },
+      effective,
+      ...(offer && { offer }),
+    };
   };
-  return { id, element, head, doc, mark };
+  return { id, head, doc, set, create };
 }
 
 function numeric(parameter: Parameter, changed: Changed): Field {
-  const { id, element, head, doc, mark } = frame(parameter, changed);
+  const { id, head, doc, set, create } = frame(parameter, changed);
   const whole = parameter.kind === "integer";
   const scale = new Scale(...parameter.usual, whole);
   const exact = el("input", { type: "number", id, class: "exact", step: "any", min: parameter.min, max: parameter.max, placeholder: parameter.fallback ?? "–", inputmode: whole ? "numeric" : "decimal" });
@@ -63,108 +78,75 @@ function numeric(parameter: Parameter, changed: Changed): Field {
   head.append(el("span", { class: "number" }, exact, el("span", { class: "unit", "aria-hidden": "true" }, parameter.unit)));
   doc.before(slider);
   if (parameter.unit) exact.setAttribute("aria-description", `in ${parameter.unit}`);
-  let [value, shown] = [undefined as string | undefined, parameter.fallback];
+  let [current, shown] = [undefined as string | undefined, parameter.fallback];
   let dragging = false;
-  const update = () => {
+  const update = (value: string | undefined) => {
+    // The user may be typing.
+    if (document.activeElement !== exact || value !== current) exact.value = value ?? "";
+    current = value;
     const now = value ?? shown;
     const known = now !== undefined && now !== "" && Number.isFinite(Number(now));
     if (!dragging) slider.value = String(known ? scale.position(Number(now)) : Math.round(scale.steps / 2));
     slider.setAttribute("aria-valuetext", known ? `${number(Number(now), 3)} ${parameter.unit}`.trim() : parameter.fallbackWords);
     slider.classList.toggle("vague", !known);
-    if (document.activeElement !== exact) exact.value = value ?? "";
     exact.placeholder = shown === undefined ? "–" : number(Number(shown), 3);
-    mark(value !== undefined);
   };
+  const slid = (live: boolean) => set(String(scale.value(slider.valueAsNumber)), live);
   slider.addEventListener("pointerdown", () => (dragging = true));
   for (const end of ["pointerup", "pointercancel"]) slider.addEventListener(end, () => (dragging = false));
-  slider.addEventListener("input", () => changed(parameter.name, String(scale.value(slider.valueAsNumber)), dragging));
+  slider.addEventListener("input", () => slid(dragging));
   slider.addEventListener("change", () => {
     dragging = false;
-    changed(parameter.name, String(scale.value(slider.valueAsNumber)), false);
+    slid(false);
   });
-  exact.addEventListener("change", () => changed(parameter.name, exact.value.trim() === "" ? undefined : exact.value.trim(), false));
-  update();
-  return {
-    parameter,
-    element,
-    get value() {
-      return value;
-    },
-    set value(next) {
-      value = next;
-      if (document.activeElement === exact && exact.value !== (next ?? "")) exact.value = next ?? "";
-      update();
-    },
-    effective(next) {
-      shown = next === undefined ? parameter.fallback : String(next);
-      update();
-    },
-  };
+  exact.addEventListener("change", () => set(exact.value.trim() || undefined));
+  return create(update, (next) => {
+    shown = next === undefined ? parameter.fallback : String(next);
+    update(current);
+  });
 }
 
 function menu(parameter: Parameter, changed: Changed): Field {
-  const { id, element, head, mark } = frame(parameter, changed);
+  const { id, head, set, create } = frame(parameter, changed);
   const select = el("select", { id, "aria-describedby": `${id}-doc` });
   const named = parameter.fallback !== undefined && parameter.values.includes(parameter.fallback);
   if (!named) select.append(el("option", { value: "" }, parameter.fallbackWords === "absent" ? "off" : parameter.fallbackWords));
   for (const word of parameter.values) select.append(el("option", { value: word }, word));
   head.append(select);
-  select.addEventListener("change", () => changed(parameter.name, select.value === "" || select.value === parameter.fallback ? undefined : select.value, false));
-  let value: string | undefined;
-  const update = () => {
-    select.value = value ?? (named ? (parameter.fallback ?? "") : "");
-    mark(value !== undefined);
-  };
-  update();
-  return { parameter, element, get value() { return value; }, set value(next) { value = next; update(); }, effective: () => undefined };
+  select.addEventListener("change", () => set(select.value === "" || select.value === parameter.fallback ? undefined : select.value));
+  return create((value) => (select.value = value ?? (named ? (parameter.fallback ?? "") : "")));
 }
 
 function toggle(parameter: Parameter, changed: Changed): Field {
-  const { id, element, head, mark } = frame(parameter, changed);
+  const { id, head, set, create } = frame(parameter, changed);
   const box = el("input", { type: "checkbox", id, role: "switch", "aria-describedby": `${id}-doc` });
   head.append(box);
   const standard = parameter.fallback === "true";
-  box.addEventListener("change", () => changed(parameter.name, box.checked === standard ? undefined : String(box.checked), false));
-  let value: string | undefined;
-  const update = () => {
-    box.checked = value === undefined ? standard : value === "true";
-    mark(value !== undefined);
-  };
-  update();
-  return { parameter, element, get value() { return value; }, set value(next) { value = next; update(); }, effective: () => undefined };
+  box.addEventListener("change", () => set(box.checked === standard ? undefined : String(box.checked)));
+  return create((value) => (box.checked = value === undefined ? standard : value === "true"));
 }
 
 function text(parameter: Parameter, changed: Changed): Field {
-  const { id, element, head, mark } = frame(parameter, changed);
+  const { id, head, set, create } = frame(parameter, changed);
   const attributes = { id, "aria-describedby": `${id}-doc` };
   const input = el("input", { type: "text", class: "wide", autocomplete: "off", spellcheck: "false", placeholder: parameter.fallbackWords, ...attributes });
   const select = el("select", attributes);
   head.append(input);
-  const set = (text: string) => changed(parameter.name, text.trim() === "" ? undefined : text.trim(), false);
-  input.addEventListener("change", () => set(input.value));
-  select.addEventListener("change", () => set(select.value));
-  let value: string | undefined;
+  for (const control of [input, select]) control.addEventListener("change", () => set(control.value.trim() || undefined));
+  let current: string | undefined;
   let offers: Offer[] = [];
-  const update = () => {
+  const update = (value: string | undefined) => {
+    current = value;
     input.value = value ?? "";
     const isOther = value !== undefined && !offers.some(([offered]) => offered === value);
     const all: Offer[] = [["", parameter.fallbackWords], ...offers, ...(isOther ? [[value, value] as Offer] : [])];
     select.replaceChildren(...all.map(([offered, label]) => el("option", { value: offered }, label)));
     select.value = value ?? "";
-    mark(value !== undefined);
   };
-  return {
-    parameter,
-    element,
-    get value() { return value; },
-    set value(next) { value = next; update(); },
-    effective(next) {
-      input.placeholder = next === undefined ? parameter.fallbackWords : String(next);
-    },
-    offer(values) {
-      offers = values;
-      (values.length ? input : select).replaceWith(values.length ? select : input);
-      update();
-    },
-  };
+  const effective: Field["effective"] = (next) => (input.placeholder = next === undefined ? parameter.fallbackWords : String(next));
+  return create(update, effective, (values) => {
+    offers = values;
+    (values.length ? input : select).replaceWith(values.length ? select : input);
+    update(current);
+  });
 }

@@ -18,9 +18,9 @@ export function report(home: HTMLElement, document: Report, timings: [string, nu
   });
   const rows = ROWS.filter((name) => document[name] !== undefined && document[name] !== null).map((name) => {
     const value = document[name];
-    const text = typeof value === "number" ? number(value, 5) : String(value);
+    const text = typeof value === "number" ? `${number(value, 5)} ${UNITS[name] ?? ""}` : String(value);
     const from = name === "resolution" && document["resolution_from"] !== "resolution" && document["resolution_from"] ? ` (from ${String(document["resolution_from"]).replaceAll("_", " ")})` : "";
-    return el("tr", { "data-row": name }, el("th", { scope: "row" }, name === "euler" ? "Euler number" : name), el("td", {}, `${text} ${UNITS[name] ?? ""}${from}`.trim()));
+    return el("tr", { "data-row": name }, el("th", { scope: "row" }, name === "euler" ? "Euler number" : name), el("td", {}, `${text.trim()}${from}`));
   });
   const device = document["device"] ?? document["backend"];
   const parts: Node[] = [el("div", { class: "checks" }, ...checks), el("table", {}, el("tbody", {}, ...rows))];
@@ -40,9 +40,15 @@ export function report(home: HTMLElement, document: Report, timings: [string, nu
 }
 
 /** Fetches the report of a result. Null if the result is not stored; then the page shows the report in the file. */
-export async function storedReport(client: Client, headers: Headers): Promise<Report | null> {
+export async function storedReport(client: Client, headers: Headers, signal: AbortSignal): Promise<Report | null> {
   const key = /\/v1\/results\/([0-9a-f]{64})\./.exec(headers.get("content-location") ?? "")?.[1];
-  return key ? client.json<Report>(`/v1/results/${key}/report.json`).catch(() => null) : null;
+  return key ? client.json<Report>(`/v1/results/${key}/report.json`, { signal }).catch(() => null) : null;
+}
+
+/** Returns what a coarse tile has in common with the whole surface, with `measures` in place of area and volume. */
+export function sharedReport(tile: Report, measures: string): Report {
+  const shared = ["atoms", "isovalue", "smoothness", "surface", "probe", "preset"].map((name) => [name, tile[name]]);
+  return { ...Object.fromEntries(shared), triangles: measures, area: measures, volume: measures };
 }
 
 /** Returns the stage times of a report, or of `Server-Timing`, ms. */

@@ -1,9 +1,9 @@
-/** View of a surface: direction, magnification and centre, independent of the size of the canvas. */
+/** View of the camera: direction, magnification and centre, independent of the size of the canvas. */
 
 import { MathUtils, type PerspectiveCamera, type Sphere, Vector3 } from "three";
 import type { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
 
-export interface View {
+export interface CameraView {
   /** Direction from the centre of the view to the camera, degrees: about the y axis, from +z to +x. */
   azimuth: number;
   /** Angle of this direction above the plane of x and z, degrees. */
@@ -18,7 +18,7 @@ export interface View {
 const MAX_ELEVATION = 88.8;
 
 /** Initial view: the whole surface from the front, slightly from the right and from above. */
-export const FRONT: View = {
+export const FRONT: CameraView = {
   azimuth: MathUtils.radToDeg(Math.atan2(0.25, 1)),
   elevation: MathUtils.radToDeg(Math.atan2(0.2, Math.hypot(0.25, 1))),
   zoom: 1,
@@ -32,7 +32,7 @@ function distance(camera: PerspectiveCamera, { radius }: Sphere): number {
 }
 
 /** Moves the camera and the centre of its view, `target`. */
-export function place(camera: PerspectiveCamera, target: Vector3, sphere: Sphere, view: View): void {
+export function place(camera: PerspectiveCamera, target: Vector3, sphere: Sphere, view: CameraView): void {
   const elevation = MathUtils.clamp(view.elevation, -MAX_ELEVATION, MAX_ELEVATION);
   const [phi, theta] = [90 - elevation, view.azimuth].map(MathUtils.degToRad) as [number, number];
   target.fromArray(view.shift).add(sphere.center);
@@ -41,7 +41,7 @@ export function place(camera: PerspectiveCamera, target: Vector3, sphere: Sphere
 }
 
 /** Returns the view of the camera. */
-export function viewOf(camera: PerspectiveCamera, target: Vector3, sphere: Sphere): View {
+export function viewOf(camera: PerspectiveCamera, target: Vector3, sphere: Sphere): CameraView {
   const offset = camera.position.clone().sub(target);
   const azimuth = MathUtils.radToDeg(Math.atan2(offset.x, offset.z));
   const elevation = MathUtils.radToDeg(Math.atan2(offset.y, Math.hypot(offset.x, offset.z)));
@@ -50,13 +50,13 @@ export function viewOf(camera: PerspectiveCamera, target: Vector3, sphere: Spher
 }
 
 /** Returns a view that is turned by angles, radians, and magnified by a factor. */
-export function moved({ azimuth, elevation, zoom, shift }: View, right: number, down: number, nearer: number): View {
+export function moved({ azimuth, elevation, zoom, shift }: CameraView, right: number, down: number, nearer: number): CameraView {
   const degrees = MathUtils.radToDeg;
   return { azimuth: azimuth - degrees(right), elevation: elevation + degrees(down), zoom: zoom * nearer, shift };
 }
 
 /** Returns azimuth, elevation and magnification, and the centre if it is shifted, separated by commas. */
-function numbersOf(view: View): string {
+function numbersOf(view: CameraView): string {
   // Fewer digits would move edges by a visible fraction of a pixel.
   const text = (value: number) => String(Number(value.toFixed(4)) || 0);
   const [numbers, shift] = [[view.azimuth, view.elevation, view.zoom].map(text), view.shift.map(text)];
@@ -64,13 +64,13 @@ function numbersOf(view: View): string {
 }
 
 /** Returns a view as text; empty for `FRONT`. */
-export function textOfView(view: View): string {
+export function cameraText(view: CameraView): string {
   const text = numbersOf(view);
   return text === numbersOf(FRONT) ? "" : text;
 }
 
-/** Returns the view that `textOfView` wrote; `FRONT` if the text is no view. */
-export function viewOfText(text: string): View {
+/** Returns the view that `cameraText` wrote; `FRONT` if the text is no view. */
+export function parseCamera(text: string): CameraView {
   const words = text.split(",");
   const numbers = words.map((word) => (word.trim() === "" ? Number.NaN : Number(word)));
   const isView = [3, 6].includes(words.length) && numbers.every(Number.isFinite);
