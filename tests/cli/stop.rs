@@ -111,7 +111,7 @@ fn requests_cut_off_by_the_drain_get_a_response() {
     let block = cli_support::block(30);
     std::thread::scope(|scope| {
         // One runs for long, the other one waits for the worker.
-        let clients = ["0.1", "0.11"].map(|resolution| {
+        let clients = ["0.07", "0.075"].map(|resolution| {
             let path = format!("/v1/meshes?resolution={resolution}");
             let block = &block;
             scope.spawn(move || send(addr, "POST", &path, &[], block.as_bytes()))
